@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from dexsim.core.cli import enable_caches
     from dexsim.env.config import EnvConfig
     from dexsim.env.env import Env
-    from dexsim.env.evaluation import Evaluation
-    from dexsim.env.snapshot import take_snapshot
+    from dexsim.env.evaluation import Evaluation, take_snapshot
     from dexsim.env.state import Start, State
     from dexsim.env.task import GroundTruth, Task
     from dexsim.hand.kinematics import Hand
@@ -85,6 +84,6 @@ __getattr__, __dir__ = open_door(
         "register": "dexsim.registry",
         "render_episode": "dexsim.render.render",
         "render_frame": "dexsim.render.render",
-        "take_snapshot": "dexsim.env.snapshot",
+        "take_snapshot": "dexsim.env.evaluation",
     },
 )

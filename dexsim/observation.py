@@ -6,6 +6,7 @@ know which world it is in. Shapes: J joints, F fingers, N taxels a finger.
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,8 @@ class Readings:
     goal_quat: jax.Array  # [4] target orientation of the object
     command: jax.Array  # [] grip command in [0, 1]
     last_action: jax.Array  # [J] in [-1, 1]
+    past_actions: jax.Array | None = None  # [2, J], the two before `last_action`, newest first
+    palm_gravity: jax.Array | None = None  # [3] unit vector; measured while the object lies flat, before the episode
 
 
 @pytree_dataclass
@@ -57,15 +60,11 @@ class Features:
     contact_centre: jax.Array  # [F, 3] m
     finger_force: Callable[[], jax.Array]  # [F] N, estimated from taxels and torque
     pose: HandPose
-    motion: Motion | None
+    motion: Any  # `Motion`; None for an actor, whose fields do not ask for it
     twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
 
-    def known_motion(self) -> Motion:
-        assert self.motion is not None, "the critic's fields need the motion"
-        return self.motion
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class ObservationField:
     """A named piece of an observation: all there is to know about it."""
 
@@ -113,103 +112,32 @@ def _angles(hand: Hand, encoding: str) -> int:
 FIELDS: dict[str, ObservationField] = {
     field.name: field
     for field in (
+        ObservationField("joint_position", _per_joint, "hand", lambda f: f.readings.joint_position),
+        ObservationField("joint_torque", _per_joint, "hand", lambda f: f.readings.joint_torque, scale=0.3),
+        ObservationField("object_position", _fixed(3), "camera", lambda f: f.readings.object_position),
+        ObservationField("object_velocity", _fixed(3), "camera", lambda f: f.readings.object_velocity),
+        ObservationField("contact_force", _per_finger(1), "hand", lambda f: f.contact_force, scale=5.0),
+        ObservationField("contact_centre", _per_finger(3), "hand", lambda f: f.contact_centre.ravel(), scale=0.1),
+        ObservationField("finger_force", _per_finger(1), "hand", lambda f: f.finger_force(), scale=5.0),
+        ObservationField("fingertip_position", _per_finger(3), "hand", lambda f: f.pose.tip_position.ravel()),
         ObservationField(
-            name="joint_position",
-            size=_per_joint,
-            source="hand",
-            compute=lambda f: f.readings.joint_position,
+            "fingertip_rotation", _per_finger(6), "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel()
         ),
+        ObservationField("command", _fixed(1), "user", lambda f: f.readings.command[None], scale=0.5),
+        ObservationField("last_action", _per_joint, "policy", lambda f: f.readings.last_action, scale=1.0),
         ObservationField(
-            name="joint_torque",
-            size=_per_joint,
-            scale=0.3,
-            source="hand",
-            compute=lambda f: f.readings.joint_torque,
-        ),
-        ObservationField(
-            name="object_position",
-            size=_fixed(3),
-            source="camera",
-            compute=lambda f: f.readings.object_position,
-        ),
-        ObservationField(
-            name="object_velocity",
-            size=_fixed(3),
-            source="camera",
-            compute=lambda f: f.readings.object_velocity,
-        ),
-        ObservationField(
-            name="contact_force",
-            size=_per_finger(1),
-            scale=5.0,
-            source="hand",
-            compute=lambda f: f.contact_force,
-        ),
-        ObservationField(
-            name="contact_centre",
-            size=_per_finger(3),
-            scale=0.1,
-            source="hand",
-            compute=lambda f: f.contact_centre.ravel(),
-        ),
-        ObservationField(
-            name="finger_force",
-            size=_per_finger(1),
-            scale=5.0,
-            source="hand",
-            compute=lambda f: f.finger_force(),
-        ),
-        ObservationField(
-            name="fingertip_position",
-            size=_per_finger(3),
-            source="hand",
-            compute=lambda f: f.pose.tip_position.ravel(),
-        ),
-        ObservationField(
-            name="fingertip_rotation",
-            size=_per_finger(6),
-            source="hand",
-            compute=lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(),
-        ),
-        ObservationField(
-            name="command",
-            size=_fixed(1),
-            scale=0.5,
-            source="user",
-            compute=lambda f: f.readings.command[None],
-        ),
-        ObservationField(
-            name="last_action",
-            size=_per_joint,
+            "past_actions",
+            lambda hand, encoding: 2 * hand.num_joints,
+            "policy",
+            lambda f: jnp.ravel(f.readings.past_actions),
             scale=1.0,
-            source="policy",
-            compute=lambda f: f.readings.last_action,
         ),
-        ObservationField(name="relative_orientation", size=_angles, source="imu", compute=_relative_orientation),
-        ObservationField(
-            name="object_orientation",
-            size=_angles,
-            source="imu",
-            compute=lambda f: _encode(f.readings.object_quat, f.encoding),
-        ),
-        ObservationField(
-            name="fingertip_velocity",
-            size=_per_finger(6),
-            source="simulator",
-            compute=lambda f: f.twist().ravel(),
-        ),
-        ObservationField(
-            name="joint_velocity",
-            size=_per_joint,
-            source="simulator",
-            compute=lambda f: f.known_motion().joint_velocity,
-        ),
-        ObservationField(
-            name="object_spin",
-            size=_fixed(3),
-            source="simulator",
-            compute=lambda f: f.known_motion().object_spin,
-        ),
+        ObservationField("palm_gravity", _fixed(3), "imu", lambda f: f.readings.palm_gravity, scale=1.0),
+        ObservationField("relative_orientation", _angles, "imu", _relative_orientation),
+        ObservationField("object_orientation", _angles, "imu", lambda f: _encode(f.readings.object_quat, f.encoding)),
+        ObservationField("fingertip_velocity", _per_finger(6), "simulator", lambda f: f.twist().ravel()),
+        ObservationField("joint_velocity", _per_joint, "simulator", lambda f: f.motion.joint_velocity),
+        ObservationField("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin),
     )
 }
 """Every field by name. A field of one's own is one more entry."""
@@ -319,7 +247,7 @@ def observe(
         finger_force=lambda: estimate_force(config.force, hand, readings.taxel_force, readings.joint_torque),
         pose=pose,
         motion=motion,
-        twist=lambda: tip_twist(hand, readings.joint_position, features.known_motion().joint_velocity),
+        twist=lambda: tip_twist(hand, readings.joint_position, features.motion.joint_velocity),
     )
     parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
     return jnp.concatenate(parts).astype(jnp.float32)

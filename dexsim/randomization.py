@@ -89,7 +89,7 @@ class Randomization(Config):
     """Efficiency eta; nominal 1."""
     latency: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
     """Delay from command to motor, common to all joints, in whole sub-steps; nominal 0. At most
-    one control tick is modelled."""
+    two control ticks are modelled."""
     latency_spread: tuple[float, float] = setting((0.0, 0.005), unit="s", low=0.0, high=0.2)
     """Further delay of each joint by itself (the bus serves them in turn); nominal 0."""
     ripple: tuple[float, float] = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
@@ -204,7 +204,7 @@ def sample_hand(
     latency = values["latency"][0] + values["latency_spread"]
     return HandParams(
         actuator=actuator,
-        latency=jnp.minimum(latency, control_period) / timestep,
+        latency=jnp.minimum(latency, 2 * control_period) / timestep,
         sensing_latency=jnp.clip(values["sensing_latency"][0] / control_period, 0.0, 1.0),
         torque_gain=values["torque_gain"],
         taxel_gain=drawn["taxel_gain"][: hand.num_fingers, None],

@@ -74,8 +74,8 @@ def run(experiment: Experiment, budget: Budget, output: Path, work: Path, only: 
         for seed in missing:
             print(f"{experiment.name}: {row.label}, seed {seed}", file=sys.stderr, flush=True)
             started = time.perf_counter()
-            found = experiment.measure(row, seed, budget, work / experiment.name / row.name / f"seed{seed}")
-            seeds[str(seed)] = found | {"wall_s": round(time.perf_counter() - started, 1)}
+            result = experiment.measure(row, seed, budget, work / experiment.name / row.name / f"seed{seed}")
+            seeds[str(seed)] = result | {"wall_s": round(time.perf_counter() - started, 1)}
             about = {
                 "experiment": experiment.name,
                 "row": settings_of(row),

@@ -31,7 +31,6 @@ class Budget:
     """Options of the training command for one seed, by skill. Empty: shipped policies stand in, nothing is trained."""
     learner: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
     """Changes to the preset's PPO settings, by skill."""
-    seeds: int = 3
     episodes: dict[str, int]
     """Evaluation in simulation, by skill."""
     trials: dict[str, int]
@@ -51,7 +50,6 @@ BUDGETS = {
         name="smoke",
         level=0,
         training={},
-        seeds=1,
         episodes={"grasp": 10, "rotate": 10},
         trials={"grasp": 1, "rotate": 1},
         seconds={"grasp": 0.3, "rotate": 0.3},
@@ -82,6 +80,12 @@ BUDGETS = {
         processes=8,
     ),
 }
+BUDGETS["long"] = dataclasses.replace(
+    BUDGETS["gpu"],
+    name="long",
+    level=3,
+    training={"grasp": {"steps": 3e8, "evaluate_every": 0}, "rotate": {"steps": 3e8, "evaluate_every": 0}},
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,6 +114,10 @@ class Row:
         return self.task.partition("_")[0]
 
 
+Measure = Callable[[Row, int, Budget, Path], dict[str, Any]]
+"""`measure(row, seed, budget, work)`: the report of one seed; `work` is the folder of its training."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
     """A table, and figures of it."""
@@ -117,18 +125,17 @@ class Experiment:
     name: str
     title: str
     rows: tuple[Row, ...]
-    measure: Callable[[Row, int, Budget, Path], dict[str, Any]]
-    """`measure(row, seed, budget, work)`: the report of one seed; `work` is the folder of its training."""
+    measure: Measure
     table: Callable[["Experiment", dict[str, dict]], list[list[str]]]
     """Header and rows, from the reports by row."""
     draw: Callable[["Experiment", dict[str, dict], Path], None] | None = None
     """Writes figures into a folder."""
-    trains: bool = False
-    """Whether every seed of a row is a training run."""
+    training_seeds: int = 0
+    """Training runs of each row; 0: nothing is trained."""
 
     def seeds(self, budget: Budget) -> range:
         """Seeds of each row; what is not trained has one."""
-        return range(budget.seeds if self.trains else 1)
+        return range(self.training_seeds if self.training_seeds and budget.training else 1)
 
 
 def report_path(folder: Path, experiment: Experiment, row: Row) -> Path:
@@ -160,18 +167,18 @@ def weights_of(file: Path) -> str:
 
 def missing_seeds(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> list[int]:
     """Seeds that a row's report, which may be empty, lacks for a budget."""
-    wanted = list(experiment.seeds(budget))
+    expected = list(experiment.seeds(budget))
     if not report or report["row"] != settings_of(row) or BUDGETS[report["budget"]].level < budget.level:
-        return wanted
+        return expected
     if BUDGETS[report["budget"]].level > budget.level:
         return []
-    return [seed for seed in wanted if str(seed) not in report["seeds"]]
+    return [seed for seed in expected if str(seed) not in report["seeds"]]
 
 
 @functools.cache
 def commit() -> str:
     """The commit that runs, in seven digits, and whether the code differs from it."""
     git, code = ["git", "-C", str(ROOT)], ("dexsim", "dexsim_ppo", "dexsim_real", "benchmarks", "assets")
-    found = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True)
+    head = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True)
     changed = subprocess.run([*git, "status", "--porcelain", "-uno", *code], capture_output=True, text=True)
-    return found.stdout.strip() + (" (changed)" if changed.stdout.strip() else "")
+    return head.stdout.strip() + (" (changed)" if changed.stdout.strip() else "")

@@ -30,10 +30,10 @@ def _paper(name: str) -> dict[str, str]:
     return dict(zip(("mean / median / s each / s to fall", "sorted"), _PAPER[name], strict=True))
 
 
-def _observation_rows(task: str) -> tuple[Row, ...]:
-    """The seven rows of the paper's table, trained on a task."""
+def _observation_rows(task: str, also: tuple[str, ...] = ()) -> tuple[Row, ...]:
+    """The seven rows of the paper's table, trained on a task with these settings besides."""
     return tuple(
-        Row(name=name, label=label, task=task, settings=settings, paper=_paper(name))
+        Row(name=name, label=label, task=task, settings=(*settings, *also), paper=_paper(name))
         for name, (label, settings) in _OBSERVATIONS.items()
     )
 
@@ -76,29 +76,34 @@ def _sweep_rows() -> tuple[Row, ...]:
 
 # Targets as far beyond the thumb as the paper's are, without what our default adds to its reward.
 _PER_FINGER = ("finger_force=[2,7]", "max_force=10", "control.reach=0.5", "reward.overload=0", "control.force.gain=0")
-_REWARDS = (
-    Row(
-        name="both",
-        label="R_force and R_torque",
-        task="grasp",
-        settings=("reward.force=2", "reward.torque=0.2", *_PER_FINGER),
-        paper={"force range [N]": "44.50–93.92", "torque range": "1.09–1.52"},
-    ),
-    Row(
-        name="force",
-        label="R_force alone",
-        task="grasp",
-        settings=("reward.force=2", "reward.torque=0", *_PER_FINGER),
-        paper={"force range [N]": "37.29–70.02", "torque range": "0.69–0.75"},
-    ),
-    Row(
-        name="torque",
-        label="R_torque alone",
-        task="grasp",
-        settings=("reward.force=0", "reward.torque=2", *_PER_FINGER),
-        paper={"force range [N]": "38.45–47.12", "torque range": "0.85–1.02"},
-    ),
-)
+_RANGES = {
+    "both": ("44.50–93.92", "1.09–1.52"),
+    "force": ("37.29–70.02", "0.69–0.75"),
+    "torque": ("38.45–47.12", "0.85–1.02"),
+}
+"""The paper's: of the contact force [N], and of the joint torque."""
+
+
+def _reward_rows(task: str, weights: dict[str, tuple[str, ...]], also: tuple[str, ...] = ()) -> tuple[Row, ...]:
+    labels = {"both": "R_force and R_torque", "force": "R_force alone", "torque": "R_torque alone"}
+    return tuple(
+        Row(
+            name=name,
+            label=labels[name],
+            task=task,
+            settings=(*settings, *also),
+            paper=dict(zip(("force range [N]", "torque range"), _RANGES[name], strict=True)),
+        )
+        for name, settings in weights.items()
+    )
+
+
+_REWARDS = {
+    "both": ("reward.force=2", "reward.torque=0.2"),
+    "force": ("reward.force=2", "reward.torque=0"),
+    "torque": ("reward.force=0", "reward.torque=2"),
+}
+_EXACT_REWARDS = {"both": (), "force": ("reward.torque=0",), "torque": ("reward.force=0",)}
 _READINGS = (
     ("nothing", "nothing ablated", ()),
     ("force", "contact force ablated", ("contact_force",)),
@@ -115,16 +120,34 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        trains=True,
+        training_seeds=3,
     ),
     Experiment(
         name="observations_paper",
         title="Observations of the rotation, the paper's reward and success test",
+        rows=_observation_rows("rotate_paper", ("control.last_action_encoding=target", "skin.total=pressing")),
+        measure=measure.trained,
+        table=tables.rotation,
+        draw=figures.successes,
+        training_seeds=3,
+    ),
+    Experiment(
+        name="exact_observations",
+        title="Observations of the rotation, the paper's task exactly",
         rows=_observation_rows("rotate_paper"),
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        trains=True,
+        training_seeds=5,
+    ),
+    Experiment(
+        name="exact_rewards",
+        title="Rewards of the grasp, the paper's task exactly",
+        rows=_reward_rows("grasp_paper", _EXACT_REWARDS),
+        measure=measure.trained,
+        table=tables.grasp,
+        draw=figures.command_curves,
+        training_seeds=5,
     ),
     Experiment(
         name="readings",
@@ -133,23 +156,23 @@ _ALL = (
             Row(name=name, label=label, task="rotate", policy="rotate", ablate=ablate)
             for name, label, ablate in _READINGS
         ),
-        measure=measure.evaluated,
+        measure=measure.measured("simulation"),
         table=tables.rotation,
     ),
     Experiment(
         name="rewards",
         title="Rewards of the grasp",
-        rows=_REWARDS,
+        rows=_reward_rows("grasp", _REWARDS, _PER_FINGER),
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
-        trains=True,
+        training_seeds=3,
     ),
     Experiment(
         name="force",
         title="Force and torque over the command, shipped grasp policy",
         rows=(Row(name="grasp", label="shipped policy", task="grasp", policy="grasp"),),
-        measure=measure.shipped,
+        measure=measure.measured("simulation", "hand"),
         table=tables.commands,
         draw=figures.command_curves,
     ),
@@ -163,7 +186,7 @@ _ALL = (
                 ("rotate_without_orientation", "no orientation", "no_orientation"),
             )
         ),
-        measure=measure.on_the_hand,
+        measure=measure.measured("hand"),
         table=tables.rotation,
         draw=figures.successes,
     ),

@@ -68,11 +68,11 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
     _save(figure, folder / "force_and_torque.svg")
 
 
-def _curve(found: list[dict[str, Any]], world: str, keys: list[str]) -> tuple[np.ndarray, ...]:
+def _curve(results: list[dict[str, Any]], world: str, keys: list[str]) -> tuple[np.ndarray, ...]:
     """Commands, mean, lower and upper end of the band: the interval of one seed, the span of several."""
     tables = [
         [(row["command"], next(row[key] for key in keys if key in row)) for row in seed[world]["by_command"]]
-        for seed in found
+        for seed in results
     ]
     if not tables:
         return (np.zeros(0),) * 4

@@ -14,7 +14,7 @@ from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
-from paper.data import BUDGETS, Budget, Row
+from paper.data import BUDGETS, Budget, Measure, Row
 
 HELD_OUT_POOL = 480
 NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
@@ -32,10 +32,23 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     return _both_worlds(row, str(file), seed, budget) | {"training": training}
 
 
-def shipped(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """A shipped policy in both worlds."""
-    del work
-    return _both_worlds(row, row.policy, seed, budget)
+def measured(*worlds: str) -> Measure:
+    """How a shipped policy is measured, with observation fields ablated, in "simulation", on the emulated "hand", or in
+    both."""
+
+    def measure(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+        del work
+        report = {}
+        if "simulation" in worlds:
+            policy = load_policy(row.policy)
+            policy = policy.ablate(*row.ablate) if row.ablate else policy
+            seconds = budget.seconds.get(row.skill)
+            report["simulation"] = simulate(policy, row.settings, budget.episodes[row.skill], seconds, budget, seed)
+        if "hand" in worlds:
+            report["hand"] = trials(row.skill, row.policy, seed, budget.name)
+        return report
+
+    return measure
 
 
 def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
@@ -87,24 +100,10 @@ def task_config(row: Row) -> Any:
     return from_dict(entry.config_class, override(to_dict(entry.config()), row.settings))
 
 
-def evaluated(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """A shipped policy in simulation, with observation fields ablated."""
-    del work
-    policy = load_policy(row.policy).ablate(*row.ablate)
-    seconds = budget.seconds.get(row.skill)
-    return {"simulation": simulate(policy, row.settings, budget.episodes[row.skill], seconds, budget, seed)}
-
-
-def on_the_hand(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """Trials of a shipped policy on the emulated hand."""
-    del work
-    return {"hand": trials(row.skill, row.policy, seed, budget.name)}
-
-
 def swept(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """A shipped policy at each point of a sweep; a row without a parameter is the reference."""
     del work
-    policy, sweep, found = load_policy(row.policy), budget.sweep, []
+    policy, sweep, results = load_policy(row.policy), budget.sweep, []
     points: tuple[float | None, ...] = row.points if sweep["points"] else ()
     if len(points) > sweep["points"]:
         points = (points[0], points[-1])
@@ -112,8 +111,8 @@ def swept(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
         settings = sweep_settings(row, point)
         count, seconds = sweep["episodes"][row.skill], sweep["seconds"][row.skill]
         task = simulate(policy, settings, count, seconds, budget, seed)
-        found.append({"point": point} | _success(row.skill, task))
-    return {"points": found}
+        results.append({"point": point} | _success(row.skill, task))
+    return {"points": results}
 
 
 def sweep_settings(row: Row, point: float | None) -> list[str]:
@@ -201,8 +200,8 @@ def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     chunk = 5 * len(names)
     env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend)
     report, _ = Evaluator(env, chunk)(policy.params, episodes=budget.objects * len(names), seed=seed)
-    kept = {name: value for name, value in report["task"].items() if name != "headline"}
-    return {"simulation": kept | {"backend": env.backend}}
+    task = {name: value for name, value in report["task"].items() if name != "headline"}
+    return {"simulation": task | {"backend": env.backend}}
 
 
 def points_at_twice(low: float, high: float, floor: float = 0.0) -> tuple[float, float, float, float]:

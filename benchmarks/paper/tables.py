@@ -11,13 +11,13 @@ UNTRAINED = "not trained yet"
 
 def cell(entries: Iterable[dict[str, Any] | None], digits: int = 3) -> str:
     """A number with its interval: of one seed the 95 % interval over episodes, of several the lowest and highest."""
-    found = [entry for entry in entries if entry and _middle(entry) is not None]
-    if not found:
+    valid = [entry for entry in entries if entry and _middle(entry) is not None]
+    if not valid:
         return ""
-    values = [_middle(entry) for entry in found]
+    values = [_middle(entry) for entry in valid]
     if len(values) > 1:
         return f"{sum(values) / len(values):.{digits}g} ({min(values):.{digits}g}–{max(values):.{digits}g})"
-    low, high = found[0].get("low"), found[0].get("high")
+    low, high = valid[0].get("low"), valid[0].get("high")
     span = "" if low is None or high is None else f" ({low:.{digits}g}–{high:.{digits}g})"
     return f"{values[0]:.{digits}g}{span}"
 
@@ -64,20 +64,19 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     lines = [[*head, "measured"]]
     for row in experiment.rows:
         report = reports.get(row.name)
-        found, numbers = seeds(report), row.paper
-        there = [seed["simulation"] for seed in found if "simulation" in seed]
+        simulated = [seed["simulation"] for seed in seeds(report) if "simulation" in seed]
         line = [row.label]
         if paper:
-            line.append(numbers["mean / median / s each / s to fall"])
+            line.append(row.paper["mean / median / s each / s to fall"])
         key = "paper_successes" if row.task == "rotate_paper" else "successes"
         line += [
-            cell(s[key]["mean"] for s in there),
-            cell(s[key]["median"] for s in there),
-            cell(_seconds_each(s[key]["mean"]["mean"], s["seconds_to_fall"]["mean"]) for s in there),
-            cell(s["seconds_to_fall"] for s in there),
+            cell(s[key]["mean"] for s in simulated),
+            cell(s[key]["median"] for s in simulated),
+            cell(_seconds_each(s[key]["mean"]["mean"], s["seconds_to_fall"]["mean"]) for s in simulated),
+            cell(s["seconds_to_fall"] for s in simulated),
         ]
         if hand:
-            worlds = [seed["hand"] for seed in found if "hand" in seed]
+            worlds = [seed["hand"] for seed in seeds(report) if "hand" in seed]
             line += [
                 cell(s[key] for s in worlds),
                 cell({"median": s[key]["median"]} for s in worlds),
@@ -105,23 +104,23 @@ def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
         report = reports.get(row.name)
         line = [row.label, row.paper["force range [N]"], row.paper["torque range"]]
         for world in ("simulation", "hand"):
-            found = [seed[world] for seed in seeds(report)]
+            results = [seed[world] for seed in seeds(report)]
             line += [
-                percent(s["held"] for s in found),
-                _range(found, ("total_force", "total_force_n")),
-                _range(found, ("total_torque",)),
-                cell(s["r_resultant"] for s in found),
-                cell(s.get("r_torque") for s in found),
-                cell(s.get("slope_force_n") for s in found),
+                percent(s["held"] for s in results),
+                _range(results, ("total_force", "total_force_n")),
+                _range(results, ("total_torque",)),
+                cell(s["r_resultant"] for s in results),
+                cell(s.get("r_torque") for s in results),
+                cell(s.get("slope_force_n") for s in results),
             ]
         lines.append([*line, how(experiment, row, report)])
     return lines
 
 
-def _range(found: list[dict[str, Any]], names: tuple[str, ...]) -> str:
+def _range(results: list[dict[str, Any]], names: tuple[str, ...]) -> str:
     """Means at the first and the last command, averaged over seeds."""
     ends = []
-    for report in found:
+    for report in results:
         means = [value(row, *names) for row in report["by_command"]]
         if means[0] is not None and means[-1] is not None:
             ends.append((means[0], means[-1]))
@@ -159,12 +158,12 @@ def commands(experiment: Experiment, reports: Reports) -> list[list[str]]:
 def held_out(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """Every object, the worst first, and then every command."""
     lines = [["object", "held [%]", "r, resultant force", "r, force on the taxels", "force error [N]"]]
-    for report in (s["simulation"] for found in reports.values() for s in seeds(found)):
-        for row in sorted(report["by_shape"], key=lambda row: (row["held"]["mean"], row["shape"])):
+    for result in (s["simulation"] for report in reports.values() for s in seeds(report)):
+        for row in sorted(result["by_shape"], key=lambda row: (row["held"]["mean"], row["shape"])):
             lines.append(_object(row["shape"].replace("_", " "), row))
-        for row in report["by_command"]:
+        for row in result["by_command"]:
             lines.append([f"command {row['command']:g}, all objects", percent([row["held"]]), "", "", ""])
-        lines.append(_object("all objects, all commands", report))
+        lines.append(_object("all objects, all commands", result))
     return lines
 
 

@@ -7,7 +7,7 @@ is no hidden state and no automatic reset: `step` returns the true final observa
 in its place where asked.
 
 A task (grasp, rotate) is an object with pure methods; see `dexsim.Task`. Evaluation and pictures of an environment are
-in `dexsim.env.evaluation` and `dexsim.env.snapshot`.
+in `dexsim.env.evaluation`.
 """
 
 import dataclasses
@@ -22,17 +22,15 @@ from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
 from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.env.observer import Observer
-from dexsim.env.senses import SensorSuite
-from dexsim.env.state import Episode, SensorInput, Start, State
+from dexsim.env.senses import SensorInput, SensorSuite
+from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, forward_kinematics
-from dexsim.observation import Readings
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
-from dexsim.sensing.taxels import TaxelMemory
 from dexsim.task_spec import TaskSpec, correct_readings
 
 
@@ -88,7 +86,7 @@ class Env:
         episode = self.sampler.sample(hand_key, sensor_key, object_key, start.object, scale)
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
-        joints, place = start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos]
+        joints = start.qpos[self.physics.joint_qpos]
         target, zero = joints if start.joint_target is None else start.joint_target, jnp.zeros(self.action_size)
         command = JointCommand(action=zero, target=target, previous=target, valid=jnp.ones((), bool))
         rest = StepResult(
@@ -96,32 +94,22 @@ class Env:
             jnp.zeros((self.hand.num_fingers, 3)),
         )
         truth = self._ground_truth(episode, rest, (zero, jnp.zeros(self.action_size, bool)), zero, zero)
-        sensor_input = self.senses.at_rest(joints, place)
-        readings, taxel_memory, correction = self._sense(noise_key, episode, command, goal, sensor_input, None)
         false, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         _, metrics = reward_of(self.task, goal, truth, false)  # an episode's start earns nothing
         return State(
             key=key,
             episode=episode,
             physics=rest.state,
-            joint_target=target,
-            action=zero,
-            goal=goal,
-            sensor_input=sensor_input,
-            readings=readings,
-            tip_stiffness=truth.tip_stiffness,
-            finger_force=length(truth.finger_force),
+            previous_target=target,
             tick=none,
             length=none,
             episode_return=jnp.zeros(()),
-            obs=self.observer.observe(readings, truth, self.task.goal_readings(goal)),
             reward=jnp.zeros(()),
             terminated=false,
             truncated=false,
             metrics=metrics | _common_metrics(episode, truth, jnp.zeros(()), none, ~false),
-            taxel_memory=taxel_memory,
-            correction=correction,
             scale=scale,
+            **self._observed(noise_key, episode, command, goal, truth, None),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -138,17 +126,20 @@ class Env:
         command = self._control(state, action)
         law = self.motors.law(hand, command)
         push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
+        held = self.task.held(state.goal)
+        if held is not None:
+            push = jnp.where(held, -episode.object.mass * jnp.asarray(self.task.gravity), push)
         result = self.physics.advance(
             law, episode.object, state.physics, push, state.tip_stiffness, hand.pad_thickness_delta
         )
         result, finite = revert_if_diverged(result, state.physics, command.valid)
+        if held is not None:
+            result = result._replace(state=self._hold(held, state.physics, result.state))
         torque = self.motors.current_torque(hand, command, result.state)
 
         truth = self._ground_truth(episode, result, torque, command.action, state.action)
         goal = self.task.update(goal_key, state.goal, truth)
-        sensor_input = self.senses.input(truth)
-        readings, taxel_memory, correction = self._sense(noise_key, episode, command, goal, sensor_input, state)
-        obs = self.observer.observe(readings, truth, self.task.goal_readings(goal))
+        observed = self._observed(noise_key, episode, command, goal, truth, state)
 
         terminated = self.task.dropped(goal, truth) | ~finite
         reward, metrics = reward_of(self.task, state.goal, truth, terminated)
@@ -157,23 +148,15 @@ class Env:
             state,
             key=key,
             physics=result.state,
-            joint_target=command.target,
-            action=command.action,
-            goal=goal,
-            sensor_input=sensor_input,
-            readings=readings,
-            tip_stiffness=truth.tip_stiffness,
-            finger_force=length(truth.finger_force),
+            previous_target=state.joint_target,
             tick=tick,
             length=ticks,
             episode_return=total,
-            obs=obs,
             reward=reward,
             terminated=terminated,
             truncated=(tick >= self.task.episode_ticks) & ~terminated,
             metrics=metrics | _common_metrics(episode, truth, total, ticks, finite),
-            taxel_memory=taxel_memory,
-            correction=correction,
+            **observed,
         )
 
     def restart(self, state: State, done: jax.Array) -> State:
@@ -202,7 +185,23 @@ class Env:
         action = jnp.where(valid, jnp.clip(action, -1.0, 1.0), 0.0)
         measured = state.physics.qpos[self.physics.joint_qpos]
         target = move_target(self.config.control, self.hand, state.joint_target, action, measured)
-        return JointCommand(action=action, target=target, previous=state.joint_target, valid=valid)
+        return JointCommand(
+            action=action,
+            target=target,
+            previous=state.joint_target,
+            valid=valid,
+            earlier=state.previous_target,
+        )
+
+    def _hold(self, held: jax.Array, before: PhysicsState, after: PhysicsState) -> PhysicsState:
+        """The physics after a tick; where `held` [] the object is where it was, at rest."""
+        place, motion = self.physics.object_qpos, self.physics.object_dof
+        still = dataclasses.replace(
+            after,
+            qpos=after.qpos.at[place].set(before.qpos[place]),
+            qvel=after.qvel.at[motion].set(0.0),
+        )
+        return choose(held, still, after)
 
     def _ground_truth(
         self,
@@ -239,25 +238,49 @@ class Env:
             last_action=last_action,
         )
 
-    def _sense(
+    def _sensor_input(self, state: State) -> SensorInput:
+        """What the sensors saw in a tick."""
+        qpos = state.physics.qpos
+        place = qpos[self.physics.object_qpos]
+        return SensorInput(
+            joint_position=qpos[self.physics.joint_qpos],
+            joint_torque=state.joint_torque,
+            taxel_force=state.taxel_force,
+            object_position=place[:3],
+            object_quat=place[3:] / jnp.linalg.norm(place[3:]),
+        )
+
+    def _observed(
         self,
         key: jax.Array,
         episode: Episode,
         command: JointCommand,
         goal: Any,
-        sensor_input: SensorInput,
+        truth: GroundTruth,
         last: State | None,
-    ) -> tuple[Readings, TaxelMemory, jax.Array | None]:
-        """Readings of a tick after the state `last` (None at an episode's start), what the taxels remember, and the
-        force loop's correction of the command."""
-        shown = self.task.goal_readings(goal)
+    ) -> dict[str, Any]:
+        """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
+        truth the next tick needs: fields of `State`."""
+        now, shown = self.senses.input(truth), self.task.goal_readings(goal)
+        before = now if last is None else self._sensor_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, memory = self.senses.read(key, episode, sensor_input, shown, action, last)
-        if not self.spec.force_loop:
-            return readings, memory, None
+        readings, taxel_memory = self.senses.read(key, episode, now, before, shown, action, last)
         correction = None if last is None else last.correction
-        readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
-        return readings, memory, correction
+        if self.spec.force_loop:
+            readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
+        return {
+            "joint_target": command.target,
+            "action": command.action,
+            "goal": goal,
+            "joint_torque": now.joint_torque,
+            "taxel_force": now.taxel_force,
+            "readings": readings,
+            "taxel_memory": taxel_memory,
+            "correction": correction,
+            "obs": self.observer.observe(readings, truth, shown),
+            "tip_stiffness": truth.tip_stiffness,
+            "finger_force": length(truth.finger_force),
+        }
 
 
 def _common_metrics(

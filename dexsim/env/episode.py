@@ -34,9 +34,9 @@ class EpisodeSampler:
         """One episode.
 
         Args:
-          hand_key, sensor_key, object_key: of hand and IMU, of the sensors, and of the object's bulk.
-          object: of the start state. Its shape stays, for the state was chosen for it; what of its bulk the task
-            draws (`Task.object_ranges`) is drawn anew.
+          hand_key, sensor_key, object_key: of hand and IMU, of the sensors, and of the object's physical properties.
+          object: of the start state. Its shape stays, for the state was chosen for it; the physical properties that the
+            task draws (`Task.object_ranges`) are drawn anew.
           scale: [] in [0, 1], narrows every range about nominal; None for 1.
         """
         if self._bulk:

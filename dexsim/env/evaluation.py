@@ -1,4 +1,4 @@
-"""What an evaluation runs: its episodes, each from a start state that training never had.
+"""What an evaluation runs: its episodes, each from a start state that training never had; and pictures of them.
 
 The pool of start states that an environment is made with belongs to training. An evaluation draws its own, by its
 own seed, and gives every episode a row and a random key of its own: what is measured does not depend on how many
@@ -11,13 +11,14 @@ import itertools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
-from dexsim.env.snapshot import take_snapshot
 from dexsim.env.state import Start, State
 from dexsim.env.task import Task
+from dexsim.geometry import rotations
 from dexsim.render.snapshot import Snapshot
 
 _POOL, _EPISODES = 0xE7A1, 0xE7A2  # streams of an evaluation's seed; training's pool has the seed's own key
@@ -27,7 +28,7 @@ _POOL, _EPISODES = 0xE7A1, 0xE7A2  # streams of an evaluation's seed; training's
 class EvaluationPlan:
     """The episodes of an evaluation, [N, ...] each."""
 
-    key: jax.Array  # [N] of bulk, hand, sensors, noise and pushes
+    key: jax.Array  # [N] of physical properties, hand, sensors, noise and pushes
     row: np.ndarray  # [N] of the evaluation's pool; episodes with the same one are not independent
     start: Start
     goal: Any  # the task's own pytree
@@ -65,31 +66,49 @@ def evaluation_of(env: Any) -> Any:
     return Evaluation(env) if isinstance(env, Env) else env
 
 
+def take_snapshot(env: Env, state: State) -> Snapshot:
+    """What a frame of video shows of one environment's state."""
+    place = state.physics.qpos[env.physics.object_qpos]
+    shape = state.episode.object.shape()
+    turning = env.task.turn is not None
+    return Snapshot(
+        joint_position=state.physics.qpos[env.physics.joint_qpos],
+        object_position=place[:3],
+        object_rotation=rotations.quat_to_matrix(place[3:]),
+        primitive_size=shape.size,
+        primitive_position=shape.position,
+        primitive_rotation=shape.rotation,
+        primitive_active=shape.active,
+        taxel_force=state.readings.taxel_force,
+        command=state.readings.command,
+        target_force=env.task.target_force(state.goal),
+        finger_force=state.finger_force,
+        goal_rotation=rotations.quat_to_matrix(state.readings.goal_quat) if turning else None,
+        turns=env.task.turns(state.goal),
+        seconds=state.length.astype(jnp.float32) * env.control_period,
+    )
+
+
 def make_plan(task: Task, count: int, seed: int) -> EvaluationPlan:
-    """The plan of `count` episodes (host).
+    """The plan of `count` episodes (host), from a pool with rows enough for them.
 
     Raises:
       ConfigError: see `Task.make_pool`.
     """
     key = jax.random.key(seed)
-    pool, row, goal = _pool_and_plan(task, count, jax.random.fold_in(key, _POOL))
+    parts = (
+        jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(jax.random.fold_in(key, _POOL), part)))
+        for part in itertools.count()
+    )
+    pool: Any = next(parts)
+    row, goal = task.evaluation_plan(count, pool.object.shape_index)
+    # A plan that repeats rows of a pool twice as large means to.
+    while len(np.unique(row)) < count and len(pool.qpos) < 2 * count:
+        pool = jax.tree.map(lambda *rows: np.concatenate(rows), pool, next(parts))
+        row, goal = task.evaluation_plan(count, pool.object.shape_index)
     return EvaluationPlan(
         key=jax.random.split(jax.random.fold_in(key, _EPISODES), count),
-        row=row,
-        start=jax.tree.map(lambda rows: rows[row], pool),
+        row=np.asarray(row),
+        start=jax.tree.map(lambda rows: rows[np.asarray(row)], pool),
         goal=goal,
     )
-
-
-def _pool_and_plan(task: Task, count: int, key: jax.Array) -> tuple[Start, np.ndarray, Any]:
-    """A pool with rows enough for `count` episodes, the row [count] of each, and the goals."""
-    pool: Any = None
-    for part in itertools.count():
-        more = jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(key, part)))
-        pool = more if pool is None else jax.tree.map(lambda *parts: np.concatenate(parts), pool, more)
-        row, goal = task.evaluation_plan(count, pool.object.shape_index)
-        row = np.asarray(row)
-        # A plan that repeats rows of a pool twice as large means to.
-        if len(np.unique(row)) == count or len(pool.qpos) >= 2 * count:
-            return pool, row, goal
-    raise AssertionError("unreachable")

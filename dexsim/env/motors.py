@@ -29,6 +29,7 @@ class JointCommand:
     target: jax.Array  # [J] rad
     previous: jax.Array  # [J] rad, acts until the latency is over
     valid: jax.Array  # [] bool, whether the action was finite
+    earlier: jax.Array | None = None  # [J] rad, the target before `previous`; None: the same
 
 
 class Motors:
@@ -41,9 +42,10 @@ class Motors:
 
     def law(self, hand: HandParams, command: JointCommand) -> TorqueLaw:
         """The torque [J] Nm on the links, from sub-step to sub-step, for `Physics.advance`."""
+        delay = self._delay(hand, command)
 
         def torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
-            target = delayed_target(substep, hand.latency, command.previous, command.target)
+            target = delayed_target(substep, *delay)
             torque = drive(hand.actuator, target, jnp.zeros_like(target), position, velocity)
             return apply_friction(hand.actuator, torque, velocity, self._inertia_rate)
 
@@ -55,9 +57,17 @@ class Motors:
         """The torque [J] Nm that the motors' currents correspond to at the end of a tick, before friction, and whether
         it [J] is at its limit."""
         position, velocity = state.qpos[self._physics.joint_qpos], state.qvel[self._physics.joint_dof]
-        target = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
+        target = delayed_target(jnp.asarray(self._substeps), *self._delay(hand, command))
         arguments = hand.actuator, target, jnp.zeros_like(target), position, velocity
         return drive(*arguments), at_limit(*arguments)
+
+    def _delay(self, hand: HandParams, command: JointCommand) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Latency [J] in sub-steps within this tick, and the targets [J] before and after it. A latency of more than a
+        tick shifts both targets to the tick before."""
+        earlier = command.previous if command.earlier is None else command.earlier
+        late = hand.latency > self._substeps
+        latency = jnp.where(late, hand.latency - self._substeps, hand.latency)
+        return latency, jnp.where(late, earlier, command.previous), jnp.where(late, command.previous, command.target)
 
 
 def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) -> None:
@@ -88,8 +98,7 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
     value, joint = largest(step)
     if value < 4:
         return
-    steps = np.linspace(step, 0.0, 200, endpoint=False)
-    stable = next((s for s in steps if largest(s)[0] < 4), 0.0)
+    stable = next(s for s in np.linspace(step, 0.0, 200) if largest(s)[0] < 4)
     raise ConfigError(
         f"PhysicsConfig.timestep = {step:g} s: the stiffest motors drawn are unstable at joint "
         f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h d / I = {value:.2f}, must be below 4): "

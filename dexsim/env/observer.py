@@ -48,6 +48,8 @@ class Observer:
             goal_quat=goal_quat,
             command=command,
             last_action=readings.last_action,
+            past_actions=readings.past_actions,
+            palm_gravity=readings.palm_gravity,
         )
         motion = Motion(truth.joint_velocity, truth.object_spin)
         # The actor's pose follows from measured angles, which are not the true ones.

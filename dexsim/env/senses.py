@@ -8,13 +8,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
-from dexsim.env.state import Episode, SensorInput, State
+from dexsim.env.state import Episode, State
 from dexsim.env.task import GroundTruth, Task
+from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import Readings
+from dexsim.randomization import tilted_down
 from dexsim.sensing.imu import measure_orientation
 from dexsim.sensing.taxels import TaxelArray, TaxelMemory
+
+
+@pytree_dataclass
+class SensorInput:
+    """What the sensors see at one instant, before latency, noise and counts."""
+
+    joint_position: jax.Array  # [J] rad
+    joint_torque: jax.Array  # [J] 1, torque over its limit
+    taxel_force: jax.Array  # [F, N] N
+    object_position: jax.Array  # [3] m
+    object_quat: jax.Array  # [4]
 
 
 class SensorSuite:
@@ -25,21 +39,6 @@ class SensorSuite:
         self.period = config.physics.control_period
         self.taxels = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
-
-    def at_rest(self, joints: jax.Array, place: jax.Array) -> SensorInput:
-        """What the sensors see at an episode's start, where nothing touches.
-
-        Args:
-          joints: [J] rad.
-          place: [7] m and unit quaternion of the object.
-        """
-        return SensorInput(
-            joint_position=joints,
-            joint_torque=jnp.zeros(self.hand.num_joints),
-            taxel_force=jnp.zeros(self.hand.taxel_area.shape),
-            object_position=place[:3],
-            object_quat=place[3:],
-        )
 
     def input(self, truth: GroundTruth) -> SensorInput:
         """What the sensors see after a tick."""
@@ -56,6 +55,7 @@ class SensorSuite:
         key: jax.Array,
         episode: Episode,
         now: SensorInput,
+        before: SensorInput,
         goal: tuple[jax.Array, jax.Array],
         last_action: jax.Array,
         last: State | None = None,
@@ -65,7 +65,7 @@ class SensorSuite:
         Args:
           key: of the noise.
           episode: the hand, the IMU and the taxels.
-          now: what the sensors see.
+          now, before: what the sensors see, and saw a tick ago.
           goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
           last_action: [J], the action that led here, as observations show it.
           last: the state one tick ago; None at the start of an episode.
@@ -74,7 +74,6 @@ class SensorSuite:
           The readings, and what the taxels remember.
         """
         sensing, hand = self.config.sensing, episode.hand
-        before = now if last is None else last.sensor_input
         age = hand.sensing_latency
         late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, now, before)
         keys = jax.random.split(key, 5)
@@ -97,8 +96,23 @@ class SensorSuite:
             goal_quat=goal_quat,
             command=command,
             last_action=last_action,
+            past_actions=self._past_actions(last_action, last),
+            palm_gravity=self._palm_gravity(episode),
         )
         return readings, memory
+
+    def _past_actions(self, last_action: jax.Array, last: State | None) -> jax.Array:
+        if last is None:
+            return jnp.stack([last_action, last_action])
+        assert last.readings.past_actions is not None
+        return jnp.stack([last.readings.last_action, last.readings.past_actions[0]])
+
+    def _palm_gravity(self, episode: Episode) -> jax.Array:
+        """Where gravity [3] points, by an IMU whose frame the object's pose at rest has aligned, with that error."""
+        down = tilted_down(-np.asarray(self._up), episode.hand.tilt)
+        bias = episode.imu.bias
+        angle = jnp.sqrt(jnp.sum(bias**2) + 1e-20)
+        return rotations.rotate(rotations.quat_to_matrix(rotations.axis_angle_to_quat(bias / angle, angle)), down)
 
     def _read_place(self, key: jax.Array, late: SensorInput, last: State | None) -> tuple[jax.Array, jax.Array]:
         """The object's position [3] m and the filtered estimate of its velocity [3] m/s."""

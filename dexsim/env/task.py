@@ -150,6 +150,11 @@ class Task(abc.ABC):
         del key, object
         return jnp.zeros(3)
 
+    def held(self, goal: Any) -> jax.Array | None:
+        """Whether [] bool somebody holds the object where it is during the next tick; None for never."""
+        del goal
+        return None
+
     @abc.abstractmethod
     def dropped(self, goal: Any, truth: GroundTruth) -> jax.Array:
         """Whether [] bool the episode has failed and ends here. `goal` is the one after the tick."""
@@ -227,11 +232,9 @@ def check_task(task: Any) -> Task:
 
 def reward_of(task: Task, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The task's reward [] as a float, and its metrics; raises ConfigError where it returns something else."""
-    result: Any = task.reward(goal, truth, dropped)
-    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-        raise ConfigError(f"task {task.name!r}: reward must return (reward, metrics); got {type(result).__name__}")
-    for name, value in (("reward", result[0]), *result[1].items()):
+    reward, metrics = task.reward(goal, truth, dropped)
+    for name, value in {"reward": reward, **metrics}.items():
         if jnp.shape(value) != ():
             raise ConfigError(f"task {task.name!r}: {name} must be a scalar; got shape {jnp.shape(value)}")
     # The state begins with a float, and a compiled loop carries it.
-    return jnp.asarray(result[0], float), result[1]
+    return jnp.asarray(reward, float), metrics

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexsim.core.compilation import jit
 from dexsim.env.env import Env
-from dexsim.env.snapshot import take_snapshot
+from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
 from dexsim.render.render import CAMERAS

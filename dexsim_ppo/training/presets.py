@@ -76,7 +76,7 @@ PRESETS = {
 def find_preset(name: str, task: str) -> Preset:
     """The preset of a device, adapted to our tasks; `task` is a name without its module."""
     preset = PRESETS.get(name, PRESETS["cpu"])
-    grasp, rotate, cpu = task == "grasp", task.startswith("rotate"), name != "gpu"
+    grasp, rotate, cpu = task.startswith("grasp"), task.startswith("rotate"), name != "gpu"
     if not (grasp or rotate):
         return preset
     if cpu:  # Large steps find a skill, smaller ones refine it. They would end Pendulum's learning.

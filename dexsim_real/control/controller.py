@@ -96,6 +96,7 @@ class Controller:
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
         self.correction = np.zeros((), np.float32)  # of the command, by the force loop
+        self.past_actions = np.tile(self._recall(self.last_action, self.target), (2, 1))  # as observations show them
         self.carry = self.policy.initial_carry()
 
     def resume(self, position: np.ndarray) -> None:
@@ -118,7 +119,8 @@ class Controller:
           command: grip command in [0, 1].
         """
         last_action = np.asarray(self._recall(self.last_action, self.target))
-        readings = make_readings(measured, estimate, goal_quat, command, last_action)
+        readings = make_readings(measured, estimate, goal_quat, command, last_action, self.past_actions)
+        self.past_actions = np.stack([last_action, self.past_actions[0]])
         if self.spec.force_loop:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)

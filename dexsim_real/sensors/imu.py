@@ -144,6 +144,12 @@ class ImuReader:
         when, quat = self._newest
         return when, multiply(multiply(self._world, quat), conjugate(self._mount))
 
+    @property
+    def palm_gravity(self) -> np.ndarray:
+        """Where gravity [3] points in the palm frame, by the last alignment."""
+        assert self._world is not None, "`calibrate` first"
+        return multiply(multiply(self._world, np.array([0.0, 0.0, 0.0, -1.0])), conjugate(self._world))[1:]
+
     def close(self) -> None:
         """Nothing is open here."""
 

@@ -21,6 +21,8 @@ class ObjectEstimate:
     position: np.ndarray  # [3] m
     velocity: np.ndarray  # [3] m/s
     quat: np.ndarray  # [4] (w, x, y, z)
+    palm_gravity: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    """[3] unit vector, by the IMU's alignment; zeros without an IMU."""
 
 
 def sources_of(names: Sequence[str]) -> set[str]:
@@ -38,7 +40,12 @@ def sources_of(names: Sequence[str]) -> set[str]:
 
 
 def make_readings(
-    measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
+    measured: HandMeasurement,
+    estimate: ObjectEstimate,
+    goal_quat: np.ndarray,
+    command: float,
+    last_action: np.ndarray,
+    past_actions: np.ndarray,
 ) -> Readings:
     """The `Readings` of one tick, float32 as in simulation.
 
@@ -48,6 +55,7 @@ def make_readings(
       goal_quat: [4] goal orientation of the object.
       command: grip command in [0, 1].
       last_action: [J] the action that led to these measurements.
+      past_actions: [2, J] the two before it, newest first.
     """
     known = {
         "joint_position": measured.joint_position,
@@ -59,6 +67,8 @@ def make_readings(
         "goal_quat": goal_quat,
         "command": command,
         "last_action": last_action,
+        "past_actions": past_actions,
+        "palm_gravity": estimate.palm_gravity,
     }
     arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in known.items()}
     return Readings(**arrays)

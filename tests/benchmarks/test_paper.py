@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-from dexsim.core.assets import asset_path
-from dexsim.core.errors import ConfigError
-
 pytest.importorskip("serial")
 if not (ROOT / "docs" / "results").exists():
     pytest.skip("needs a checkout", allow_module_level=True)
@@ -44,7 +41,7 @@ def stub(paper, **changes):
         return {"value": len(calls)}
 
     rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
-    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "trains": True}
+    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "training_seeds": 3}
     return paper.data.Experiment(rows=rows, measure=measure, **given | changes), calls
 
 
@@ -94,13 +91,13 @@ class TestResuming:
         assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
     def test_a_larger_budget_measures_anew_and_a_smaller_one_keeps(self, paper, here):
-        experiment, calls = stub(paper, trains=False)
+        experiment, calls = stub(paper, training_seeds=0)
         for name, count in (("smoke", 3), ("cpu", 6), ("smoke", 6), ("cpu", 6), ("gpu", 9)):
             paper.command.run(experiment, paper.data.BUDGETS[name], here, here / "work")
             assert len(calls) == count, name
 
     def test_another_setting_is_another_row(self, paper, here):
-        experiment, calls = stub(paper, trains=False)
+        experiment, calls = stub(paper, training_seeds=0)
         budget = paper.data.BUDGETS["cpu"]
         paper.command.run(experiment, budget, here, here / "work")
         changed = dataclasses.replace(experiment.rows[1], settings=("reward.force=1",))
@@ -110,29 +107,6 @@ class TestResuming:
         assert calls[3:] == [("b", 0)]
         relabelled = dataclasses.replace(changed, label="another label", paper={"x": "1"})
         assert paper.data.settings_of(relabelled) == paper.data.settings_of(changed)
-
-    def test_list_tells_what_is_done(self, paper, here):
-        experiment, _ = stub(paper)
-        budget = paper.data.BUDGETS["cpu"]
-        only = dataclasses.replace(experiment, rows=experiment.rows[:1])
-        paper.command.run(only, budget, here, here / "work")
-        _, first, second, _ = paper.command.listing(experiment, budget, here)
-        assert "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
-
-    def test_rows_can_be_measured_apart(self, paper, here):
-        experiment, calls = stub(paper)
-        budget = paper.data.BUDGETS["cpu"]
-        paper.command.run(experiment, budget, here, here / "work", only=["b"])
-        assert {name for name, _ in calls} == {"b"} and len(calls) == 3
-        paper.command.run(experiment, budget, here, here / "work")
-        assert [name for name, _ in calls[3:6]] == ["a"] * 3, "what another process measured is not done again"
-        with pytest.raises(ConfigError, match="--row quaternio: not a row of observations; --list names them"):
-            paper.command.main(["observations", "--row", "quaternio"])
-
-    def test_an_unknown_name_is_refused(self, paper, capsys):
-        with pytest.raises(SystemExit):
-            paper.command.main(["reward"])
-        assert "invalid choice: 'reward'" in capsys.readouterr().err
 
 
 class TestTraining:
@@ -169,29 +143,6 @@ class TestTraining:
         assert (arguments.seed, arguments.minutes, arguments.backend) == (2, 20.0, "c")
         paper.measure.train(self.row(paper), 2, budget, folder)
         assert len(trained) == 1, "a finished training is not repeated"
-
-    def test_a_budget_of_steps_has_no_limit_of_time(self, paper, trained, here):
-        row = paper.experiments.EXPERIMENTS["observations"].rows[0]
-        _, found = paper.measure.train(row, 0, paper.data.BUDGETS["gpu"], here / "seed0")
-        options = trained[0][2]
-        assert (options["steps"], options["minutes"]) == (4e7, 0.0)
-        assert (options["ppo"].num_envs, options["ppo"].kl_target, found["kl_target"]) == (8192, 0.04, 0.04)
-        report = {"seeds": {"0": {"training": found}}, "budget": "gpu"}
-        assert paper.tables.how(None, row, report) == "1 × 40 million steps, gpu budget"
-
-    def test_it_resumes_from_a_checkpoint(self, paper, trained, here):
-        folder = here / "seed0"
-        (folder / "checkpoints").mkdir(parents=True)
-        (folder / "checkpoints" / "00000010.msgpack").touch()
-        paper.measure.train(self.row(paper), 0, paper.data.BUDGETS["cpu"], folder)
-        assert trained == [(None, None, {"resume": folder})]
-
-    def test_it_begins_anew_without_one(self, paper, trained, here):
-        folder = here / "seed0"
-        (folder / "checkpoints").mkdir(parents=True)
-        (folder / "metrics.jsonl").touch()
-        paper.measure.train(self.row(paper), 0, paper.data.BUDGETS["cpu"], folder)
-        assert trained[0][2]["run_dir"] == folder and not (folder / "metrics.jsonl").exists()
 
 
 # --- what the rows are ----------------------------------------------------------------------------------
@@ -242,11 +193,6 @@ def test_observations_of_the_rows(paper):
     }
 
 
-def test_sweeps_reach_twice_the_range_of_training(paper):
-    assert paper.measure.points_at_twice(0.6, 1.2) == pytest.approx((0.3, 0.6, 1.2, 1.5))
-    assert paper.measure.points_at_twice(0.05, 0.2, 0.02) == pytest.approx((0.02, 0.05, 0.2, 0.275))
-
-
 # --- objects that no training has seen ------------------------------------------------------------------
 
 
@@ -259,47 +205,8 @@ class TestHeldOut:
             assert np.all(shape["inertia"] > 0) and shape["inertia"].sum() > 2 * shape["inertia"].max(), name
         assert len(paper.held_out.NAMES) == 24 and set(paper.held_out.HEAVY) < set(paper.held_out.NAMES)
 
-    def test_no_composition_is_one_of_training(self, paper):
-        """Training has a box or a cylinder with one capsule along its z."""
-        for name in paper.held_out.NAMES[:12]:
-            kinds = sorted(part["kind"] for part in paper.held_out.CATALOGUE[name]["parts"])
-            assert kinds not in (["box", "capsule"], ["capsule", "cylinder"]) or name == "mace"
-
-    def test_mass_properties(self, paper):
-        """A plate in closed form."""
-        plate = paper.held_out.shape_of("plate")
-        (a, b, c) = np.sort(plate["size"][0])
-        closed = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 3
-        assert np.sort(plate["inertia"]) == pytest.approx(np.sort(closed), rel=0.02)
-
-    @pytest.mark.slow
-    def test_objects_are_drawn_with_their_own_mass(self, paper, hand):
-        import jax
-
-        from dexsim.tasks.grasp.config import GraspConfig
-
-        names = ("cross", "anvil")
-        task = paper.held_out.HeldOutGrasp(GraspConfig(pool_size=8), hand, names)
-        keys = jax.random.split(jax.random.key(0), 40)
-        objects = [jax.vmap(lambda k, i=i: task.sample_object(k, task.config, np.int32(i)))(keys) for i in (0, 1)]
-        light, heavy = (np.asarray(object.mass) for object in objects)
-        assert 0.05 <= light.min() and light.max() <= 0.2 and 0.25 <= heavy.min() and heavy.max() <= 0.35
-        assert "objects.mass" not in task.object_ranges and "objects.friction" in task.object_ranges
-        assert np.asarray(objects[0].active)[0].sum() == 2 and np.asarray(objects[1].active)[0].sum() == 3
-
 
 # --- tables ---------------------------------------------------------------------------------------------
-
-
-def test_a_cell_is_of_one_seed_or_of_several(paper):
-    cell = paper.tables.cell
-    one = {"mean": 0.5, "low": 0.4, "high": 0.6}
-    assert cell([one]) == "0.5 (0.4–0.6)" and cell([one, {"mean": 0.7}]) == "0.6 (0.5–0.7)"
-    assert (
-        cell([{"r": 0.25, "low": None, "high": None}]) == "0.25"
-        and cell([None, {"mean": None}]) == ""
-        and paper.tables.percent([one]) == "50 (40–60)"
-    )
 
 
 def test_rows_without_training_say_so(paper):
@@ -321,11 +228,6 @@ def test_reports_of_other_weights_do_not_count(paper, tmp_path):
     path.write_text(json.dumps(report | {"row": report["row"] | {"weights": "0" * 16}}))
     assert paper.command.reports_of(experiment, tmp_path) == {}
     assert paper.data.missing_seeds(experiment, row, paper.data.BUDGETS["cpu"], json.loads(path.read_text())) == [0]
-
-
-def test_weights_tell_policies_apart(paper):
-    files = [asset_path(f"policies/{name}.msgpack") for name in ("grasp", "rotate", "rotate_clear")]
-    assert len({paper.data.weights_of(file) for file in files}) == 3
 
 
 def test_committed_tables_agree_with_the_reports(paper):

@@ -43,14 +43,6 @@ def test_it_waits_for_two_fingers_beside_the_thumb(force, moves):
     assert float(after) == pytest.approx(0.2 + moves * 0.5 * (1 - (3 - 2) / 5) * PERIOD)
 
 
-def test_where_all_commands_mean_one_force_none_is_corrected():
-    for force in (0.5, 3.0, 9.0):
-        after = correct_command(
-            LOOP, (3.0, 3.0), PERIOD, jnp.asarray(0.5), jnp.zeros(()), fingers(9, force, force, 0, 0)
-        )
-        assert float(after) == 0.0
-
-
 def test_a_command_speaks_of_the_mean_over_touching_fingers_without_the_thumb():
     force = fingers(9.0, 4.0, 0.5, 2.0, 0.0)
     touching = jnp.array([True, True, False, True, False])

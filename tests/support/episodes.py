@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 
+from dexsim.env.task import GroundTruth
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
-from dexsim.touch.feel import feel_links
+from dexsim.touch.feel import Touch, feel_links
 from dexsim.touch.surface import skin_surface
 
 
@@ -23,6 +24,32 @@ def ground_truth(env, object, physics, force):
     zero = jnp.zeros(env.hand.num_joints)
     episode = SimpleNamespace(object=object, hand=SimpleNamespace(pad_thickness_delta=0.0))
     return env._ground_truth(episode, StepResult(physics, force), (zero, zero > 0), zero, zero)
+
+
+def still_moment(hand, position, **changes):
+    """A `GroundTruth` at rest: the middle posture, an object at `position` that nothing touches; with these changes."""
+    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
+    zero, fingers, nothing = jnp.zeros(hand.num_joints), jnp.zeros(hand.num_fingers), jnp.zeros(hand.taxel_area.shape)
+    moment = GroundTruth(
+        object=None,
+        joint_position=joints,
+        joint_velocity=zero,
+        joint_torque=zero,
+        torque_limited=zero > 0,
+        pose=forward_kinematics(hand, joints),
+        finger_force=jnp.zeros((hand.num_fingers, 3)),
+        normal_force=fingers,
+        touch=Touch(nothing, nothing, nothing),
+        tip_stiffness=fingers + 1,
+        object_position=jnp.asarray(position),
+        object_quat=jnp.array([1.0, 0, 0, 0]),
+        object_velocity=jnp.zeros(3),
+        object_spin=jnp.zeros(3),
+        action=zero,
+        last_action=zero,
+    )
+    kept = {name: value if name in ("object", "touch") else jnp.asarray(value) for name, value in changes.items()}
+    return dataclasses.replace(moment, **kept)
 
 
 def reset_to(env):

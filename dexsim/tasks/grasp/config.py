@@ -6,6 +6,7 @@ from dexsim.control import Control
 from dexsim.core.config import Config, check_ranges, setting
 from dexsim.env.config import EnvConfig
 from dexsim.force_loop import ForceLoop
+from dexsim.touch.skin import Skin
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,8 @@ class GraspConfig(EnvConfig):
     """Largest speed along the palm, in each direction, at release."""
     release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
     """Largest spin about each of the object's axes at release."""
+    release_delay: tuple[float, float] = setting((0.0, 0.0), unit="s", low=0.0, high=2.0)
+    """Range of the time for which somebody still holds the object after the fingers have begun to move."""
     place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
     """Largest shift of the object along the palm, in each direction."""
     turn_noise: tuple[float, float] = setting((0.6, 0.3), unit="rad", low=0.0, high=3.2)
@@ -92,4 +95,16 @@ class GraspConfig(EnvConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, "finger_force", "curl", "release_gap", "release_speed")
+        check_ranges(self, "finger_force", "curl", "release_gap", "release_speed", "release_delay")
+
+
+def paper() -> GraspConfig:
+    """The paper's rewards: the narrow Gaussian alone, the thumb's binary terms, nothing for holding and no penalty of
+    force. The paper gives no weight and no target in N: docs/equations.md."""
+    return GraspConfig(
+        control=Control(),
+        finger_force=(2.0, 7.0),
+        max_force=10.0,
+        reward=GraspReward(force=2.0, torque=2.0, alive=0.0, overload=0.0, tail=0.0, thumb="binary"),
+        skin=Skin(total="solver"),
+    )

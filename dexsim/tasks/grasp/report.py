@@ -10,7 +10,10 @@ SETTLE = 3.0  # s after release from which forces count
 FORCES = {"r_resultant": "force", "r_normal": "normal", "r_taxels": "taxels"}
 """Correlations with the command, and what of the contact force each takes: all of it with friction, what of it presses
 into the skin, and what of that the taxels bear. The metric is `finger_` and this."""
-_MEANS = "total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited"
+_COMMANDED = tuple(f"finger_{part}" for part in FORCES.values())
+_MEANS = ("total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited")
+_UNITS = {"total_torque": "total_torque", "touching": "touching_fingers", "torque_limited": "torque_limited"}
+"""Names of what is not in N, by metric."""
 
 
 def window(seconds: float) -> tuple[float, float]:
@@ -48,18 +51,37 @@ def summarize(
       Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
-    held = alive[-1]
+    held, command, shape = alive[-1], metrics["command"][0], metrics["shape"][0].astype(int)
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
-    command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
-    forces = {part: f"finger_{part}" for part in FORCES.values()}
-    # Of each episode [N], the mean over its late ticks.
-    mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
     target = target_force(command, span)
-    commanded = {part: mean_of[name] for part, name in forces.items()}
-    by_command = [_command_row(level, command, held, target, mean_of) for level in np.unique(command)]
-    by_shape = [
-        _shape_row(shapes[index], shape == index, command, held, target, commanded) for index in np.unique(shape)
-    ]
+    # Of each episode [N], the mean over its late ticks.
+    late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*_COMMANDED, *_MEANS)}
+    commanded = {part: late_means[f"finger_{part}"] for part in FORCES.values()}
+    touching = alive & (metrics["total_force"] > 0.01)
+
+    def command_row(level: float) -> dict:
+        mine = command == level
+        good = mine & held
+        return {
+            "command": float(level),
+            "episodes": int(mine.sum()),
+            "held": proportion(held[mine]),
+            "target_force_n": float(target[mine].mean()),
+            **{_UNITS.get(name, f"{name}_n"): mean(values[good]) for name, values in late_means.items()},
+            "saturates": saturates(late_means["torque_limited"][good]),
+        }
+
+    def shape_row(index: int) -> dict:
+        mine = shape == index
+        return {
+            "shape": shapes[index],
+            "episodes": int(mine.sum()),
+            "held": proportion(held[mine]),
+            **correlations(command, mine & held, commanded),
+            "force_error_n": force_error(commanded["force"][mine], target[mine]),
+        }
+
+    by_command = [command_row(level) for level in np.unique(command)]
     means = [row["total_force_n"]["mean"] for row in by_command]
     complete = all(m is not None for m in means)
     report = {
@@ -69,66 +91,23 @@ def summarize(
         "held": proportion(held),
         "hold_time_s": mean(alive.sum(0) * control_period),
         **correlations(command, held, commanded),
-        "r_torque": pearson(command[held], mean_of["total_torque"][held]),
+        "r_torque": pearson(command[held], late_means["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
-        "slope_torque": slope(command[held], mean_of["total_torque"][held]),
+        "slope_torque": slope(command[held], late_means["total_torque"][held]),
         "force_error_n": force_error(commanded["force"], target),
-        "torque_limited": mean(mean_of["torque_limited"][held]),
+        "torque_limited": mean(late_means["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
         "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
         "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
         "total_force_by_command_n": means,
-        "skin_correlation": _optional_pearson(metrics, alive),
+        # Both are of the taxels: skin beyond them may bear load as well.
+        "skin_correlation": pearson(metrics["skin_force"][touching], metrics["taxel_force"][touching], samples=0),
         "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
         "non_finite": int(metrics["non_finite"].sum()),
         "by_command": by_command,
-        "by_shape": by_shape,
+        "by_shape": [shape_row(index) for index in np.unique(shape)],
     }
     return report | {"headline": _headline(report)}
-
-
-def _command_row(
-    level: float,
-    command: np.ndarray,
-    held: np.ndarray,
-    target: np.ndarray,
-    mean_of: dict[str, np.ndarray],
-) -> dict:
-    """The episodes at one command; arrays [N] are of all episodes."""
-    mine = command == level
-    good = mine & held
-    return {
-        "command": float(level),
-        "episodes": int(mine.sum()),
-        "held": proportion(held[mine]),
-        "target_force_n": float(target[mine].mean()),
-        **{f"{n}_n": mean(mean_of[n][good]) for n in (f"finger_{part}" for part in FORCES.values())},
-        "total_force_n": mean(mean_of["total_force"][good]),
-        "total_torque": mean(mean_of["total_torque"][good]),
-        "taxel_force_n": mean(mean_of["taxel_force"][good]),
-        "thumb_force_n": mean(mean_of["thumb_force"][good]),
-        "touching_fingers": mean(mean_of["touching"][good]),
-        "torque_limited": mean(mean_of["torque_limited"][good]),
-        "saturates": saturates(mean_of["torque_limited"][good]),
-    }
-
-
-def _shape_row(
-    name: str,
-    mine: np.ndarray,
-    command: np.ndarray,
-    held: np.ndarray,
-    target: np.ndarray,
-    commanded: dict[str, np.ndarray],
-) -> dict:
-    """The episodes `mine` with one shape; arrays [N] are of all episodes."""
-    return {
-        "shape": name,
-        "episodes": int(mine.sum()),
-        "held": proportion(held[mine]),
-        **correlations(command, mine & held, commanded),
-        "force_error_n": force_error(commanded["force"][mine], target[mine]),
-    }
 
 
 def _headline(report: dict) -> dict:
@@ -145,14 +124,6 @@ def _headline(report: dict) -> dict:
         "ticks with a joint at its torque limit": entry(report["torque_limited"]),
         "force range": report["force_range"],
     }
-
-
-def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict | None:
-    if "skin_force" not in metrics:
-        return None
-    keep = alive & (metrics["total_force"] > 0.01)
-    # Both are of the taxels: skin beyond them may bear load as well.
-    return pearson(metrics["skin_force"][keep], metrics["taxel_force"][keep], samples=0)
 
 
 def saturates(torque_limited: np.ndarray) -> bool:

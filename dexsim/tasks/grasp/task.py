@@ -7,6 +7,7 @@ from its target feels a gradient.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +15,27 @@ import numpy as np
 
 from dexsim import observation
 from dexsim.control import closing
+from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.ranges import uniforms
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
 from dexsim.force_loop import commanded_force, target_force
+from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
 from dexsim.objects.config import KINDS
-from dexsim.objects.params import ObjectParams
+from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
-from dexsim.tasks.grasp.start import make_pool
+from dexsim.tasks.placement import clearance, palm_height
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
 _CONTACT = 0.01  # N, force from which a finger counts as touching
+_OVERLAP = 0.001  # m, hand and object may start this deep in each other
 
 
 @pytree_dataclass
@@ -39,6 +44,7 @@ class GraspGoal:
 
     command: jax.Array  # [] in [0, 1]
     fixed: jax.Array  # [] bool, the command never changes (evaluation)
+    delay: jax.Array | None = None  # [] s until the object is let go
 
 
 def tailed_gaussian(error: jax.Array, sigma: float, tail_sigma: float, tail: float) -> jax.Array:
@@ -115,8 +121,91 @@ class Grasp(Task):
         self.evaluation_ticks = max(round(config.evaluation_seconds / period), 1)
 
     def make_pool(self, key: jax.Array) -> Start:
-        """Objects released below the palm, between the half-closed fingers."""
-        return make_pool(key, self)
+        """Objects released below the palm, between the half-closed fingers, where the hand is clear of them.
+
+        Every shape gets an equal share of the pool: large boxes overlap far more often than small spheres, and a plain
+        rejection would all but leave them out of training.
+
+        Raises:
+          ConfigError: next to no candidate of a shape is clear, so the ranges do not fit the hand.
+        """
+        config, shapes = self.config, self.drawn_shapes
+        share = -(-config.pool_size // len(shapes))
+        chunk = max(min(2 * share, 4096), 64)
+
+        @functools.partial(compilation.jit, once=True)
+        def sample(key: jax.Array, shape_index: jax.Array) -> tuple[Start, jax.Array]:
+            return jax.vmap(lambda k: self._candidate(k, shape_index))(jax.random.split(key, chunk))
+
+        pools = []
+        for name in shapes:
+            clear_starts, count, index = [], 0, self.shape_names.index(name)
+            for trial in range(40):
+                shape_key = jax.random.fold_in(jax.random.fold_in(key, index), trial)
+                starts, clear = sample(shape_key, jnp.int32(index))
+                rows = np.flatnonzero(np.asarray(clear))[: share - count]
+                clear_starts.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
+                count += rows.size
+                if count == share:
+                    break
+            if count < share:
+                raise ConfigError(
+                    f"{type(config).__name__}: only {count} of {share} start states of "
+                    f"shape {name!r} are free of overlap; open the posture or shrink it"
+                )
+            pools.append(jax.tree.map(lambda *parts: np.concatenate(parts), *clear_starts))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[: config.pool_size], *pools)
+
+    def _candidate(self, key: jax.Array, shape_index: jax.Array) -> tuple[Start, jax.Array]:
+        """A start state with an object of this shape, and whether [] the hand is clear of it."""
+        hand, config, reference = self.hand, self.config, self.reference
+        keys = jax.random.split(key, 7)
+        object = self.sample_object(keys[0], config, shape_index)
+        sides = (-1.0, 1.0)
+        drawn = uniforms(
+            jnp.concatenate([keys[1:], jax.vmap(jax.random.fold_in, (None, 0))(keys[5], jnp.array([1, 2]))]),
+            (sides, sides, config.release_gap, sides, config.release_speed, config.curl, sides, sides),
+            None,
+            (max(hand.num_joints, 3),),
+        )
+        noise = config.posture_noise * drawn[0, : hand.num_joints]
+        (roll, turn, askew), shift = drawn[1, :3], config.place_noise * drawn[3, :2]
+        gap, speed, curl = drawn[2, 0], drawn[4, 0], drawn[5, 0]
+        drift, spin = config.release_drift * drawn[6, :2], config.release_spin * drawn[7, :3]
+        flexion = np.zeros(hand.num_joints, np.float32)
+        flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
+        joints = jnp.asarray(config.posture) + noise + curl * flexion
+        joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
+
+        # Long objects lie across the fingers (their z along the palm's y, either way), turned about the palm's normal
+        # and a little askew; the roll about their own axis is free.
+        quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
+        most = config.turn_noise
+        for axis, angle in (
+            ((1.0, 0.0, 0.0), jnp.where(drawn[3, 2] < 0.0, -0.5, 0.5) * jnp.pi),
+            ((0.0, 0.0, 1.0), most[1] * askew),
+            ((1.0, 0.0, 0.0), most[0] * turn),
+        ):
+            quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
+        matrix = rotations.quat_to_matrix(quat)
+        # How far the object reaches [6] along the palm's axes, in both directions. Its middle, not its origin, is put
+        # where the fingers meet: that of a composition is in its body, beside which the neck juts out.
+        reach = jax.vmap(
+            lambda way: extent(
+                object.size,
+                object.position,
+                object.active,
+                rotations.rotate_inverse(matrix, way),
+                object.kinds,
+                object.quat,
+            )
+        )(jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
+        middle = (reach[1:3] - reach[4:]) / 2
+        position = jnp.stack([palm_height(hand) + gap + reach[3], *(jnp.asarray(reference[1:]) + shift - middle)])
+        qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
+        qvel = jnp.concatenate([jnp.zeros(hand.num_hinges), speed[None], drift, spin])
+        start = Start(qpos=qpos, qvel=qvel, object=object)
+        return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP
 
     @property
     def drawn_shapes(self) -> tuple[str, ...]:
@@ -125,13 +214,24 @@ class Grasp(Task):
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         del start
-        return GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
+        goal = GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
+        low, high = self.config.release_delay
+        if high == 0:
+            return goal
+        return dataclasses.replace(goal, delay=jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high))
 
     def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
         del truth
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, self.config.command_change) & ~goal.fixed
-        return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
+        return dataclasses.replace(
+            goal,
+            command=jnp.where(change, jax.random.uniform(what), goal.command),
+            delay=None if goal.delay is None else goal.delay - self.config.physics.control_period,
+        )
+
+    def held(self, goal: GraspGoal) -> jax.Array | None:
+        return None if goal.delay is None else goal.delay > 0
 
     def goal_readings(self, goal: GraspGoal) -> tuple[jax.Array, jax.Array]:
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -228,6 +328,9 @@ class Grasp(Task):
             mine = target == shape
             index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
         goal = GraspGoal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
+        if self.config.release_delay[1] > 0:
+            delay = np.random.default_rng(0).uniform(*self.config.release_delay, count)
+            goal = dataclasses.replace(goal, delay=jnp.asarray(delay, jnp.float32))
         return index, goal
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:

@@ -11,6 +11,7 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.task_spec import TurnSpec
 from dexsim.tasks.rotate.objects import KINDS
+from dexsim.touch.skin import Skin
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class RotateReward(Config):
     torque: float = setting(-0.5, unit="1/Nm^2", low=-1000.0, high=0.0)
     """Weight of the squared joint torque: it discourages clamping the object at the end of a stroke."""
     spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
-    """Weight of the spin about the axis in the wanted direction, up to +-1 rad/s. It gives a gradient before the first
+    """Weight of the spin about the axis toward the goal, up to +-1 rad/s. It gives a gradient before the first
     goal is ever reached."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
     """Fingertips that should take part. The least busy of them counts: with their mean, two busy fingertips would earn
@@ -121,6 +122,9 @@ class RotateConfig(EnvConfig):
     fingertips, beside which the first stroke often fails."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
     """Largest shift of the object from its start position."""
+    trap: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Share of the start states in which the object is stuck: ahead of the reference, tipped toward the wrist and held
+    by the middle finger. Above 0, tipping and moving ahead cost in every tick, too."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time for start states to come to rest; states that do not are discarded."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
@@ -139,15 +143,16 @@ class RotateConfig(EnvConfig):
 
 
 def paper() -> RotateConfig:
-    """The paper's own weights and success test."""
+    """The paper's rewards, success test and observations. What the paper gives no number for: docs/equations.md."""
     return RotateConfig(
         turn=TurnSpec(),
         drop_distance=0.09,
         drop_tilt=math.pi,
         patience=1e6,
         drop_radius=1.0,
-        control=Control(step=0.3, last_action_encoding="target"),
+        control=Control(step=0.3),
         episode_seconds=60.0,
+        skin=Skin(total="solver"),
         reward=RotateReward(
             goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0, bonus_speed=1e6, drop=0.0
         ),

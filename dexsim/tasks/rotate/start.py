@@ -37,6 +37,13 @@ _TRIALS = 300  # rounds of candidates in which every object should find a postur
 _VERSION = 4  # of the procedure: raise it when older pools no longer hold
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _LEVEL = 0.35  # rad, largest angle from upright
+_UNUSED = (
+    *("reward", "sensing", "observation", "skin", "control", "touch", "randomization", "turn"),
+    *("episode_seconds", "evaluation_seconds", "push_probability", "push_speed"),
+)
+"""Settings that no start state depends on; what does of `turn` and `randomization` is named in `_fingerprint`."""
+_TRAPS = 128  # different starts in the trap; few candidates stay there
+_TRAP_PITCH, _TRAP_PLACE = (0.35, 0.9), 0.017  # rad toward the wrist; m from the reference toward the fingertips
 
 
 def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
@@ -52,7 +59,14 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
     leaves, structure = jax.tree.flatten(template)
     stored = _read(path, len(leaves))
     if stored is None:
-        stored = _make(key, hand, config, gravity)
+        stored = _make(key, hand, config, gravity, config.pool_size)
+        trapped = round(config.trap * config.pool_size)
+        if trapped:
+            few = _make(jax.random.fold_in(key, 1), hand, config, gravity, min(trapped, _TRAPS), trap=True)
+            stored = [
+                np.concatenate([rows[trapped:], np.resize(more, (trapped, *more.shape[1:]))])
+                for rows, more in zip(stored, few, strict=True)
+            ]
         _write(path, stored)
     qpos, qvel, joint_target, *rows = stored
     object = jax.tree.unflatten(structure, rows)
@@ -61,22 +75,7 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
 
 def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     """What the pool depends on; rewards, sensing and observation do not belong to it."""
-    settings = to_dict(config)
-    for name in (
-        "reward",
-        "sensing",
-        "observation",
-        "skin",
-        "control",
-        "touch",
-        "randomization",
-        "turn",
-        "episode_seconds",
-        "evaluation_seconds",
-        "push_probability",
-        "push_speed",
-    ):
-        settings.pop(name, None)
+    settings = {name: value for name, value in to_dict(config).items() if name not in _UNUSED}
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
     turn = config.turn.axis, config.turn.distance
     digest = hashlib.sha256(json.dumps([settings, motors, turn], sort_keys=True).encode())
@@ -107,18 +106,21 @@ def _write(path: Path, arrays: list[np.ndarray]) -> None:
         write_whole(path, [buffer.getbuffer()])
 
 
-def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[Any]:
-    """A start state for each of `pool_size` objects: qpos, qvel, joint objects, object leaves.
+def _make(
+    key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float], size: int, trap: bool = False
+) -> list[Any]:
+    """A start state for each of `size` objects: qpos, qvel, joint targets, object leaves.
 
     Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
     where whatever stays is kept they are all but left out.
     """
-    size, chunk, threads = config.pool_size, 1024, min(os.cpu_count() or 1, 16)
+    chunk, threads = 1024, min(os.cpu_count() or 1, 16)
     object_key, key = jax.random.split(key)
     objects = jax.device_get(
         jax.jit(jax.vmap(lambda k: sample_turned_object(k, config)))(jax.random.split(object_key, size))
     )
-    sample = jax.jit(jax.vmap(lambda k, object: _candidate(k, object, hand, config)))
+    candidate = _trap_candidate if trap else _candidate
+    sample = jax.jit(jax.vmap(lambda k, object: candidate(k, object, hand, config)))
     starts, waiting, tried = {}, np.arange(size), 0
     with ThreadPoolExecutor(threads) as pool:
         models = [_model(hand, config, gravity) for _ in range(threads)]
@@ -132,22 +134,21 @@ def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, 
             )
             rows = np.flatnonzero(candidates["clear"])
             rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
-            settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
+            settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates, trap=trap)
             settled = list(pool.map(settle, models, [rows[i::threads] for i in range(threads)]))
             good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
             for k in _clear_of_palm(hand, config, candidates["object"], good, qpos):
                 starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
             waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
-            if not len(waiting) or tried > 1000 and len(starts) < tried / 200:
+            if not len(waiting) or tried > 1000 and len(starts) < tried / (2000 if trap else 200):
                 break
-    if len(waiting) > size / 20:
+    if len(starts) < (1 if trap else 0.95 * size):
         raise ConfigError(
             f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
             f"in the hand ({tried} tried); change posture, tilt, edge or support"
         )
     # The few that fit nowhere leave their rows to others.
-    chosen = np.array(sorted(starts))
-    chosen = np.concatenate([chosen, chosen[: size - len(chosen)]])
+    chosen = np.resize(sorted(starts), size)
     return [
         np.stack([starts[k][0] for k in chosen]),
         np.zeros((size, hand.num_hinges + 6), np.float32),
@@ -171,14 +172,44 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
     if config.support == "palm":
         floor = palm_height(hand) + 0.001 - lowest_point(object, quat, jnp.zeros(3))
         place = place.at[0].set(floor)
-    overlap = clearance(hand, joints, object.shape(), place, rotations.quat_to_matrix(quat))
     squeeze = jax.random.uniform(keys[4], minval=config.squeeze[0], maxval=config.squeeze[1])
     closed = np.array(flexion)
     closed[flexion_joints(hand, range(1))] = 1.0
-    joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
+    target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
+    return _at(hand, object, joints, target, place, quat)
+
+
+def _trap_candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
+    """This object where rotations get stuck: ahead of the reference, tipped toward the wrist, under the fingertip of
+    the middle finger, which closes."""
+    keys = jax.random.split(key, 6)
+    joints = jnp.asarray(config.posture) + config.posture_noise * jax.random.uniform(
+        keys[0], (hand.num_joints,), minval=-1.0
+    )
+    middle = flexion_joints(hand, range(hand.num_fingers // 2, hand.num_fingers // 2 + 1))
+    joints = joints.at[middle].set(jax.random.uniform(keys[1], (len(middle),), minval=0.2, maxval=1.5))
+    joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
+    target = joints.at[middle].add(jax.random.uniform(keys[2], minval=0.1, maxval=0.6))
+    heading = config.heading_noise * jax.random.uniform(keys[3], minval=-1.0)
+    pitch = jax.random.uniform(keys[4], minval=_TRAP_PITCH[0], maxval=_TRAP_PITCH[1])
+    quat = rotations.quat_multiply(
+        rotations.axis_angle_to_quat(jnp.array([0.0, 1.0, 0.0]), pitch),
+        rotations.axis_angle_to_quat(jnp.asarray(config.turn.unit_axis), heading),
+    )
+    shift = jax.random.uniform(
+        keys[5], (3,), minval=jnp.array([0.0, -0.025, 0.0]), maxval=jnp.array([0.03, 0.0, 0.015])
+    )
+    place = jnp.asarray(config.reference) + shift + jnp.array([0.0, 0.0, _TRAP_PLACE])
+    return _at(hand, object, joints, jnp.clip(target, hand.joint_lower, hand.joint_upper), place, quat)
+
+
+def _at(
+    hand: Hand, object: ObjectParams, joints: jax.Array, target: jax.Array, place: jax.Array, quat: jax.Array
+) -> dict[str, Any]:
+    overlap = clearance(hand, joints, object.shape(), place, rotations.quat_to_matrix(quat))
     return {
         "qpos": jnp.concatenate([hinge_angles(hand, joints), place, quat]),
-        "joint_target": joint_target,
+        "joint_target": target,
         "object": object,
         "clear": overlap > -0.001,
     }
@@ -197,7 +228,7 @@ def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujo
 
 
 def _settle(
-    model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any]
+    model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any], trap: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows that came to rest where they belong, and their qpos."""
     data, object = mujoco.MjData(model), candidates["object"]
@@ -207,7 +238,7 @@ def _settle(
     pairs = contact.pairs_with(model, np.array(geoms))
     rubber = contact.pair_constants(model, pairs, tip_bodies(model, hand))[2] >= 0
     ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
-    good, kept = [], []
+    good, settled = [], []
     for row in rows:
         model.geom_size[geoms] = object.size[row]
         model.geom_pos[geoms] = object.position[row]
@@ -221,10 +252,10 @@ def _settle(
         data.qpos[:] = candidates["qpos"][row]
         model.qpos_spring[springs] = candidates["joint_target"][row]
         mujoco.mj_step(model, data, ticks)
-        if _stays(model, config, data):
+        if _stays(model, config, data, trap):
             good.append(row)
-            kept.append(data.qpos.astype(np.float32))
-    return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
+            settled.append(data.qpos.astype(np.float32))
+    return np.array(good, int), np.reshape(np.array(settled, np.float32), (len(settled), model.nq))
 
 
 def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
@@ -235,14 +266,20 @@ def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarr
     return np.flatnonzero(np.asarray(low) > palm_height(hand) + config.clearance)
 
 
-def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:
+def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData, trap: bool) -> bool:
     free = model.joint("object")
     place = data.qpos[free.qposadr[0] :][:7]
     motion = data.qvel[free.dofadr[0] :][:6]
     turned = np.empty(3)
     mujoco.mju_rotVecQuat(turned, config.turn.unit_axis, place[3:])
-    tilt = np.arccos(np.clip(turned @ config.turn.unit_axis, -1.0, 1.0))
-    near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.turn.distance
     rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
     sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
-    return bool(near and rest and sound and tilt < _LEVEL)
+    away = np.linalg.norm(place[:3] - config.reference)
+    if trap:
+        pitch = np.arctan2(-turned[2], turned[0])
+        ahead = place[2] - config.reference[2] > _TRAP_PLACE
+        inside = ahead and _TRAP_PITCH[0] < pitch < _TRAP_PITCH[1] and away < config.drop_radius
+    else:
+        tilt = np.arccos(np.clip(turned @ config.turn.unit_axis, -1.0, 1.0))
+        inside = tilt < _LEVEL and away < 0.6 * config.turn.distance
+    return bool(inside and rest and sound)

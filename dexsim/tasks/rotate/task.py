@@ -58,7 +58,7 @@ class Progress:
 
     angle: jax.Array  # [] rad, from the goal orientation
     distance: jax.Array  # [] m, from the reference
-    spin: jax.Array  # [] rad/s about the axis, positive in the wanted direction
+    spin: jax.Array  # [] rad/s about the axis, positive toward the goal
     entered: jax.Array  # [] bool
     success: jax.Array  # [] bool
 
@@ -82,6 +82,11 @@ def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) ->
 def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
     """min(duty / enough, 1) [] of the least busy of the `count` busiest fingertips; `duty` [F]."""
     return jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)[-1]
+
+
+def trap_cost(tilt: jax.Array, ahead: jax.Array) -> jax.Array:
+    """2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it."""
+    return (tilt / 0.6) ** 2 + (jnp.maximum(ahead, 0.0) / 0.022) ** 2
 
 
 class Rotate(Task):
@@ -234,6 +239,8 @@ class Rotate(Task):
             "torque": weights.torque * jnp.sum(truth.joint_torque**2),
             "drop": weights.drop * fallen,
         }
+        if self.config.trap > 0:
+            terms["trap"] = -trap_cost(self._tilt(truth), truth.object_position[2] - self.reference[2])
         ticks = jnp.maximum(after.clock / self._period, 1.0)
         mean = {name: total / ticks for name, total in after.totals.items()}
         turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from dexsim.env.senses import SensorSuite
-from dexsim.env.state import SensorInput
+from dexsim.env.senses import SensorInput, SensorSuite
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams
 from dexsim.tasks.grasp.config import GraspConfig
@@ -27,7 +27,7 @@ AGE = 0.25  # of a tick
 def read(hand):
     """`read(sensing, now, last)` gives the readings of an episode whose hand has an error of every kind."""
 
-    def run(sensing, now, last=None, key=0, age=AGE):
+    def run(sensing, now, last=None, key=0, age=AGE, bias=(0.0, 0.0, 0.0)):
         config = GraspConfig(sensing=sensing)
         suite = SensorSuite(config, hand, Grasp(config, hand))
         zero = jnp.zeros(())
@@ -36,11 +36,13 @@ def read(hand):
             encoder_bias=jnp.linspace(-0.01, 0.01, 12),
             torque_gain=jnp.full(12, 1.5),
             taxel_gain=jnp.ones(hand.taxel_area.shape),
+            tilt=jnp.array([0.1, 0.0]),
         )
         imu = ImuParams(**{f.name: zero for f in dataclasses.fields(ImuParams)})
-        imu = dataclasses.replace(imu, bias=jnp.zeros(3))
+        imu = dataclasses.replace(imu, bias=jnp.asarray(bias))
         episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.taxels.sample(jax.random.key(0), 0.0))
-        return suite.read(jax.random.key(key), episode, now, GOAL, jnp.full(12, 0.5), last)[0]
+        then = now if last is None else last.then
+        return suite.read(jax.random.key(key), episode, now, then, GOAL, jnp.full(12, 0.5), last)[0]
 
     return run
 
@@ -57,7 +59,7 @@ def seen(hand, joint, torque, place):
 
 def before(hand, readings, then):
     return SimpleNamespace(
-        sensor_input=then,
+        then=then,
         readings=readings,
         length=jnp.int32(3),
         taxel_memory=SensorSuite(GraspConfig(), hand, Grasp(GraspConfig(), hand)).taxels.init(),
@@ -105,3 +107,23 @@ def test_angles_come_in_steps_and_each_reading_has_its_own_noise(hand, read):
         assert off.std() == pytest.approx(size, rel=0.15) and abs(np.corrcoef(off[:, 0], off[:, 1])[0, 1]) < 0.5
     place = np.array([r.object_position for r in reads]) - np.array([0.05, 0, 0.1])
     assert place.std() == pytest.approx(0.03, rel=0.25)
+
+
+def test_past_actions_are_the_two_before_the_last(hand, read):
+    now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1))
+    last, shown = None, []
+    for _ in range(4):
+        reading = read(QUIET, now, last)
+        shown.append(np.asarray(reading.past_actions)[:, 0])
+        last = before(hand, dataclasses.replace(reading, last_action=jnp.full(12, len(shown) / 10)), now)
+    np.testing.assert_allclose(shown, [[0.5, 0.5], [0.1, 0.5], [0.2, 0.1], [0.3, 0.2]], rtol=1e-5)
+
+
+def test_gravity_in_the_palm_frame_has_the_mounts_lean_and_the_alignments_error(hand, read):
+    """The grasp's palm faces down (gravity +x); a pitch of 0.1 rad is about y. A wrong alignment turns it too."""
+    now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1))
+    level = np.array([np.cos(0.1), 0.0, np.sin(0.1)])
+    np.testing.assert_allclose(read(QUIET, now).palm_gravity, level, atol=1e-6)
+    bias = np.array([0.02, -0.03, 0.01])
+    expected = Rotation.from_rotvec(bias).apply(level)
+    np.testing.assert_allclose(read(QUIET, now, bias=bias).palm_gravity, expected, atol=1e-6)

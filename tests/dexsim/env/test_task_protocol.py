@@ -14,7 +14,6 @@ from dexsim.core.compilation import jit
 from dexsim.core.config import setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
-from dexsim.env.evaluation import evaluation_of
 from dexsim.env.state import Start
 from dexsim.errors import ConfigError
 
@@ -107,15 +106,6 @@ def test_it_runs_from_reset_to_restart(env):
     np.testing.assert_allclose(again.physics.qpos[:, 12], env.config.height)
 
 
-def test_it_is_evaluated_by_its_own_plan_and_report(env):
-    protocol = evaluation_of(env)
-    starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(8, 0))
-    assert starts.reward.shape == (8,)
-    report = protocol.summarize({}, np.array([[True, True], [True, False]]))
-    assert report["headline"] == {"held": 0.5}
-    assert env.spec.name == "balance" and env.spec.fields == Balance.fields["actor"]
-
-
 @pytest.mark.parametrize("reward", [1, True, jnp.int32(1), np.float64(1.0), jnp.float16(1.0)])
 def test_a_reward_may_be_any_number(env, monkeypatch, reward):
     """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
@@ -131,8 +121,6 @@ def test_a_reward_may_be_any_number(env, monkeypatch, reward):
 @pytest.mark.parametrize(
     "method, gives, message",
     [
-        ("reward", None, r"reward must return \(reward, metrics\); got NoneType"),
-        ("reward", (0.0, 0.0), r"reward must return \(reward, metrics\); got tuple"),
         ("reward", (jnp.zeros(2), {}), r"reward must be a scalar; got shape \(2,\)"),
         ("reward", (0.0, {"far": jnp.zeros(3)}), r"far must be a scalar; got shape \(3,\)"),
     ],

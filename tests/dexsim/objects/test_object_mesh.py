@@ -19,7 +19,7 @@ from dexsim.objects.boxes import fit_boxes
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
 from dexsim.objects.params import sample_object, toward_nominal, unit_inertia
-from dexsim.randomization_check.effects import check
+from dexsim.randomization_check import check
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 
@@ -238,10 +238,10 @@ def test_an_l_is_dropped_on_the_real_physics(folder):
     env = dexsim.make("grasp", config, backend="c")
     state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(jax.random.key(0))
     step, force, taxels = jit(jax.vmap(env.step), once=True), 0, 0
-    (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])
+    (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["objects.mesh_size"])
     assert {"geom_size", "geom_pos"} <= set(size.changed) and max(size.object, size.joint) > 1e-6
     for _ in range(40):
         state = step(state, jnp.ones((8, 12)))
         assert not np.any(state.metrics["non_finite"])
-        force, taxels = force + np.sum(state.finger_force > 0.5), taxels + np.sum(state.sensor_input.taxel_force > 0)
+        force, taxels = force + np.sum(state.finger_force > 0.5), taxels + np.sum(state.taxel_force > 0)
     assert force > 100 and taxels > 1000

@@ -78,7 +78,7 @@ def compare(env, states, kinds):
     found, felt = {kind: [] for kind in kinds}, closed_forms(env)
     for state in states:
         wanted, pose = felt(state)
-        read = state.sensor_input.taxel_force
+        read = state.taxel_force
         (total, at), (_, place) = centre(wanted, pose), centre(read, pose)
         moved = np.abs(np.asarray(read) - wanted).sum(-1) / 2
         apart = np.linalg.norm(np.asarray(at) - place, axis=-1)

@@ -10,18 +10,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import trimesh
+from episodes import still_moment
+from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.errors import ConfigError
-from dexsim.env.task import GroundTruth
-from dexsim.force_loop import target_force
-from dexsim.geometry import rotations
-from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
-from dexsim.physics.config import PhysicsConfig
-from dexsim.registry import TASKS
-from dexsim.tasks.grasp.config import GraspConfig, GraspReward
+from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import (
     COMMANDS,
     Grasp,
@@ -29,7 +24,6 @@ from dexsim.tasks.grasp.task import (
     command_reward,
     joint_spread,
     posture_distance,
-    tailed_gaussian,
 )
 from dexsim.tasks.terms import action_rate, joint_speed
 from dexsim.touch.feel import Touch
@@ -72,35 +66,8 @@ def gauss(error, sigma):
     return math.exp(-error * error / (2 * sigma * sigma))
 
 
-def make_moment(hand, **fields):
-    """A moment of rest at the middle posture, nothing touching, with `fields` put in."""
-    zero = jnp.zeros(12)
-    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
-    nothing = jnp.zeros((5, 120))
-    values = {
-        "object": None,
-        "joint_position": joints,
-        "joint_velocity": zero,
-        "joint_torque": zero,
-        "torque_limited": zero > 0,
-        "tip_stiffness": jnp.ones(5),
-        "pose": forward_kinematics(hand, joints),
-        "finger_force": jnp.zeros((5, 3)),
-        "normal_force": jnp.zeros(5),
-        "touch": Touch(nothing, nothing, nothing),
-        "object_position": jnp.asarray(CENTRE),
-        "object_quat": jnp.array([1.0, 0, 0, 0]),
-        "object_velocity": jnp.zeros(3),
-        "object_spin": jnp.zeros(3),
-        "action": zero,
-        "last_action": zero,
-    }
-    return GroundTruth(
-        **{
-            name: jnp.asarray(value) if name not in ("object", "pose", "touch") else value
-            for name, value in (values | fields).items()
-        }
-    )
+def make_moment(hand, **changes):
+    return still_moment(hand, CENTRE, **changes)
 
 
 def goal_of(command):
@@ -108,20 +75,6 @@ def goal_of(command):
 
 
 class TestTerms:
-    @pytest.mark.parametrize("error", [-1.3, -0.4, -0.1, 0.0, 0.05, 0.1, 0.25, 0.4, 2.0])
-    @pytest.mark.parametrize("tail", [0.0, 0.4, 1.0])
-    def test_tailed_gaussian(self, error, tail):
-        found = tailed_gaussian(jnp.float32(error), 0.1, 0.4, tail)
-        assert float(found) == pytest.approx(
-            (1 - tail) * gauss(error, 0.1) + tail * gauss(error, 0.4), rel=1e-5, abs=1e-7
-        )
-
-    def test_there_is_a_gradient_far_from_the_target(self):
-        """What the wide Gaussian is for: 5 N from the target a newton still counts."""
-        slope = jax.grad(lambda e: tailed_gaussian(e, 0.1, 0.4, 0.4))(0.5)
-        assert slope < -0.3
-        assert abs(jax.grad(lambda e: tailed_gaussian(e, 0.1, 0.4, 0.0))(0.5)) < 1e-3
-
     @pytest.mark.parametrize("thumb", ["loose", "track", "binary"])
     @pytest.mark.parametrize("value", [0.005, 0.01, 0.5, 3.0, 4.0, 9.0, 200.0, 200.5])
     def test_command_reward_of_the_thumb(self, thumb, value):
@@ -135,16 +88,10 @@ class TestTerms:
         wanted = match / 5 if 0.01 <= value <= 200.0 else 0.0
         assert float(found) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
 
-    def test_command_reward_counts_touching_fingers_within_bounds(self):
-        value = jnp.array([0.2, 0.3, 1.5, 0.0, 0.4])
-        contact = jnp.array([True, True, True, True, False])
-        found = command_reward(value, 0.3, contact, (0.01, 1.0), 1.0, dataclasses.replace(WEIGHTS, thumb="track"))
-        # thumb off by 0.1, index exact, middle above the bounds, ring below, pinky not touching
-        assert float(found) == pytest.approx((0.6 * math.exp(-0.5) + 0.4 * math.exp(-1 / 32) + 1.0) / 5, rel=1e-5)
-
-    def test_the_papers_reward_is_a_choice(self):
+    def test_grasp_paper_has_the_papers_reward(self):
         """sigma 0.1 without a tail, thumb within bounds: R_force of the paper."""
-        weights = dataclasses.replace(WEIGHTS, thumb="binary", tail=0.0)
+        weights = paper().reward
+        assert weights.alive == weights.overload == 0 and weights.torque == weights.force
         found = command_reward(
             jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool), (0.01, 200.0), 10.0, weights
         )
@@ -157,9 +104,6 @@ class TestTerms:
         assert float(action_rate(jnp.array([1.0, -1.0]), jnp.array([0.0, 1.0]))) == 5.0
         assert float(joint_speed(jnp.array([3.0, -4.0]))) == 25.0
         assert jnp.isfinite(jax.grad(posture_distance)(jnp.ones(3), jnp.ones(3))).all()
-
-    def test_target_force(self):
-        assert [float(target_force(c, (1.0, 7.0))) for c in COMMANDS] == [1.0, 2.5, 4.0, 5.5, 7.0]
 
 
 class TestReward:
@@ -244,14 +188,6 @@ class TestReward:
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
 
-    def test_overload_counts_the_four_fingers_and_only_above(self, hand, task):
-        force = np.zeros((5, 3))
-        force[:, 1] = 20.0, 4.3, 3.0, 6.4, 0.0  # targets 4 N; the thumb is free to balance them
-        _, metrics = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.zeros((), bool))
-        assert float(metrics["reward/overload"]) == pytest.approx(-2.0 * 2.0 / 10, rel=1e-5)
-        _, lost = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.ones((), bool))
-        assert float(lost["reward/overload"]) == 0.0
-
     def test_a_finger_whose_root_joint_does_not_pull_earns_no_torque_reward(self, hand, task):
         force = np.zeros((5, 3))
         force[2, 1] = 3.0
@@ -261,19 +197,6 @@ class TestReward:
             truth = make_moment(hand, finger_force=force, joint_torque=torque)
             _, metrics = task.reward(goal_of(0.0), truth, jnp.zeros((), bool))
             assert (float(metrics["reward/torque"]) > 0) == earned
-
-    def test_the_torque_target_goes_with_the_force_target(self, hand, task):
-        """At force_per_torque = 19 N/Nm a finger on its force target is on its torque target."""
-        for command in COMMANDS:
-            torque = np.zeros(12)
-            torque[hand.root_joint] = (1 + 6 * command) / 19
-            force = np.zeros((5, 3))
-            force[:, 0] = 1 + 6 * command
-            truth = make_moment(hand, finger_force=force, joint_torque=torque)
-            _, metrics = task.reward(goal_of(command), truth, jnp.zeros((), bool))
-            assert float(metrics["reward/force"]) == pytest.approx(2.0, rel=1e-4)
-            assert float(metrics["reward/torque"]) == pytest.approx(0.2, rel=1e-3)
-            assert float(metrics["force_error"]) == pytest.approx(0.0, abs=1e-4)
 
     @pytest.mark.parametrize(
         "offset, dropped",
@@ -307,18 +230,6 @@ class TestChance:
         assert np.abs(direction.mean(0)).max() < 0.15
         np.testing.assert_allclose(direction.T @ direction / hit.sum(), np.eye(3) / 3, atol=0.08)
 
-    def test_a_push_of_a_whole_tick_changes_the_speed_so(self, hand):
-        task = Grasp(GraspConfig(push_probability=1.0, push_speed=0.7), hand)
-        force = task.push(jax.random.key(3), SimpleNamespace(mass=0.2))
-        change = np.linalg.norm(force) / 0.2 * task.config.physics.control_period
-        draw = float(jax.random.uniform(jax.random.split(jax.random.key(3), 3)[2]))
-        assert change == pytest.approx(0.7 * draw, rel=1e-5)
-
-    def test_no_pushes(self, hand):
-        task = Grasp(GraspConfig(push_probability=0.0), hand)
-        keys = jax.random.split(jax.random.key(0), 100)
-        assert not np.any(jax.vmap(lambda key: task.push(key, SimpleNamespace(mass=0.1)))(keys))
-
     def test_the_command_changes_as_often_as_configured(self, hand):
         task = Grasp(GraspConfig(command_change=0.03), hand)
         keys = jax.random.split(jax.random.key(1), self.KEYS)
@@ -328,24 +239,36 @@ class TestChance:
         assert 0 <= new[changed].min() and new[changed].max() < 1
         assert new[changed].mean() == pytest.approx(0.5, abs=0.05)
 
-    def test_a_fixed_command_never_changes(self, hand):
-        task = Grasp(GraspConfig(command_change=1.0), hand)
-        fixed = GraspGoal(jnp.float32(0.25), jnp.ones((), bool))
-        keys = jax.random.split(jax.random.key(2), 50)
-        assert np.all(np.asarray(jax.vmap(lambda k: task.update(k, fixed, None).command)(keys)) == 0.25)
-
     def test_episodes_begin_with_any_command(self, task):
         keys = jax.random.split(jax.random.key(3), 2000)
         goals = jax.vmap(lambda key: task.begin(key, None))(keys)
         assert np.histogram(goals.command, 4, (0, 1))[0].min() > 400
         assert not np.any(goals.fixed)
 
-    def test_clocks(self, hand):
-        task = Grasp(
-            GraspConfig(episode_seconds=2.0, evaluation_seconds=1.5, physics=PhysicsConfig(timestep=0.005, substeps=6)),
-            hand,
+
+class TestRelease:
+    def test_the_object_is_held_until_it_is_let_go(self, monkeypatch):
+        """For 0.1 s, four ticks; then it falls freely in `SimplePhysics`."""
+        monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
+        config = GraspConfig(
+            pool_size=4, objects=ObjectConfig(shapes=("sphere",)), release_delay=(0.1, 0.1), push_probability=0.0
         )
-        assert (task.episode_ticks, task.evaluation_ticks) == (67, 50)  # of 0.03 s
+        env = dexsim.make("grasp", config, backend="c")
+        state, step, heights = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step), []
+        for _ in range(7):
+            state = step(state, jnp.zeros(12))
+            heights.append(float(state.physics.qpos[12]))
+        assert heights[:4] == [heights[0]] * 4
+        fall = 0.5 * 9.81 * (0.03 * np.arange(1, 4)) ** 2
+        np.testing.assert_allclose(np.array(heights[4:]) - heights[3], fall, rtol=0.3)
+
+    def test_delays_fill_their_range(self, hand):
+        task = Grasp(GraspConfig(release_delay=(0.1, 0.5)), hand)
+        keys = jax.random.split(jax.random.key(0), 500)
+        delay = np.asarray(jax.vmap(lambda key: task.begin(key, None).delay)(keys))
+        planned = np.asarray(task.evaluation_plan(500, np.arange(50) % 5)[1].delay)
+        for values in (delay, planned):
+            assert 0.1 <= values.min() < 0.12 and 0.48 < values.max() <= 0.5
 
 
 class TestEvaluationPlan:
@@ -361,49 +284,8 @@ class TestEvaluationPlan:
         assert cells.sum() == count and np.ptp(cells) <= 1
         assert np.ptp(cells.sum(1)) <= 1
 
-    def test_starts_of_a_cell_differ(self, task):
-        shape_index = np.random.default_rng(0).permutation(np.arange(2000) % 5)
-        index, _ = task.evaluation_plan(1000, shape_index)
-        assert len(np.unique(index)) == 1000
-
-    def test_only_the_shapes_in_the_pool(self, task):
-        shape_index = np.array([1, 3] * 30)
-        index, goal = task.evaluation_plan(100, shape_index)
-        assert np.bincount(shape_index[index], minlength=5).tolist() == [0, 50, 0, 50, 0]
-        assert np.bincount(np.asarray(goal.command * 4, int)).tolist() == [20] * 5
-
-    def test_it_does_not_depend_on_chance(self, task):
-        shape_index = np.arange(50) % 5
-        first, second = (task.evaluation_plan(64, shape_index) for _ in range(2))
-        np.testing.assert_array_equal(first[0], second[0])
-
-
-def middles(pool):
-    """Middle [N, 2] of what each object of a pool takes up along the palm (y, z), by meshes of its parts."""
-    found = []
-    for i in range(pool.qpos.shape[0]):
-        parts, object = [], jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], pool.object)
-        for kind, size, position, active in zip(object.kinds, object.size, object.position, object.active, strict=True):
-            a, b = float(size[0]), 2 * float(size[1])
-            solid = {
-                "box": lambda size=size: trimesh.creation.box(2 * size),
-                "capsule": lambda a=a, b=b: trimesh.creation.capsule(height=b, radius=a, count=[64, 64]),
-                "cylinder": lambda a=a, b=b: trimesh.creation.cylinder(radius=a, height=b, sections=128),
-            }[kind]()
-            if active:
-                parts.append(solid.apply_translation(position - (kind == "capsule") * solid.bounds.mean(0)))
-        turned = trimesh.util.concatenate(parts)
-        turned.apply_transform(trimesh.transformations.quaternion_matrix(pool.qpos[i, 15:]))
-        found.append(pool.qpos[i, 13:15] + turned.bounds.mean(0)[1:])
-    return np.array(found)
-
 
 class TestPool:
-    def test_a_composition_lies_either_way(self, grasp_env):
-        axis = rotations.quat_to_matrix(jnp.asarray(grasp_env.pool.qpos[:, 15:]))[:, 1, 2]
-        juts = np.asarray(axis)[np.asarray(grasp_env.pool.object.shape_index) == SHAPES.index("composition")]
-        assert 0.2 < np.mean(juts > 0.0) < 0.8 and np.all(np.abs(juts) > 0.5)
-
     def test_every_shape_has_its_share(self, grasp_env):
         count = np.bincount(grasp_env.pool.object.shape_index, minlength=len(SHAPES))
         assert count.tolist() == [16] * 5
@@ -444,76 +326,10 @@ class TestPool:
         for moved, most in (
             (pool.qvel[:, 13:15], config.release_drift),
             (pool.qvel[:, 15:], config.release_spin),
-            (middles(pool) - np.array(CENTRE[1:]), config.place_noise),
         ):
             assert 0.8 * most < np.max(np.abs(moved)) <= most + 1e-6
-
-    def test_one_seed_is_one_pool(self, hand):
-        task = Grasp(GraspConfig(pool_size=4, objects=ObjectConfig(shapes=("sphere",))), hand)
-        first, again, other = (task.make_pool(jax.random.key(seed)) for seed in (0, 0, 1))
-        np.testing.assert_array_equal(first.qpos, again.qpos)
-        assert first.qpos.shape == (4, 19)
-        assert not np.any(np.all(first.qpos == other.qpos, axis=1))
 
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))
         with pytest.raises(ConfigError, match="0 of 5 start states of shape 'box'"):
             Grasp(GraspConfig(pool_size=5, objects=wide), hand).make_pool(jax.random.key(0))
-
-
-class TestConfig:
-    @pytest.mark.parametrize(
-        "values, message",
-        [
-            ({"drop_distance": 5.0}, r"GraspConfig.drop_distance = 5 m: must be between 0.02 and 1 m"),
-            ({"finger_force": (3.0, 1.0)}, r"finger_force = \(3, 1\): the first must not exceed"),
-            ({"finger_force": (0.0, 1.0)}, "finger_force = 0 N"),
-            ({"curl": (0.2, 0.1)}, "curl"),
-            ({"release_gap": (0.2, 0.3)}, "release_gap = 0.2 m"),
-            ({"push_probability": 1.5}, "push_probability = 1.5"),
-            ({"episode_seconds": float("nan")}, "episode_seconds = nan: must be a finite number"),
-            ({"posture": (4.0,) * 12}, "posture = 4 rad"),
-        ],
-    )
-    def test_values_out_of_range(self, values, message):
-        with pytest.raises(ConfigError, match=message):
-            GraspConfig(**values)
-
-    @pytest.mark.parametrize(
-        "values, message",
-        [
-            ({"drop": 5.0}, "GraspReward.drop = 5"),
-            ({"sigma": 0.0}, "sigma = 0"),
-            ({"thumb": "none"}, "thumb = 'none': choose from loose, track, binary"),
-        ],
-    )
-    def test_reward_weights_out_of_range(self, values, message):
-        with pytest.raises(ConfigError, match=message):
-            GraspReward(**values)
-
-    def test_a_posture_for_another_hand(self, hand):
-        with pytest.raises(ConfigError, match="posture has 11 angles, the hand 12 joints"):
-            Grasp(GraspConfig(posture=(0.0,) * 11), hand)
-
-    def test_tasks_by_name(self):
-        with pytest.raises(ConfigError, match="unknown task 'juggle': choose from grasp"):
-            dexsim.make("juggle")
-        with pytest.raises(ConfigError, match="task 'grasp' takes a GraspConfig, not a GraspReward"):
-            dexsim.make("grasp", GraspReward())
-        with pytest.raises(ConfigError, match="backend"):
-            dexsim.make("grasp", GraspConfig(pool_size=1), backend="metal")
-        assert TASKS["grasp"].config_class is GraspConfig
-
-    def test_every_number_has_a_unit(self):
-        def walk(cls):
-            for field in dataclasses.fields(cls):
-                value = field.default if field.default is not dataclasses.MISSING else field.default_factory()
-                if dataclasses.is_dataclass(value):
-                    yield from walk(type(value))
-                elif isinstance(value, float | int) and not isinstance(value, bool):
-                    yield cls.__name__, field
-
-        fields = list(walk(GraspConfig))
-        assert len(fields) > 40
-        missing = [f"{owner}.{field.name}" for owner, field in fields if not field.metadata.get("unit")]
-        assert missing == []

