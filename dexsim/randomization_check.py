@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core import cli
-from dexsim.core.compilation import collector_paused, jit
+from dexsim.core.compilation import jit
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import align
@@ -137,8 +137,7 @@ def _run(env: Env, step: Callable, states: State, actions: jax.Array) -> dict[st
     """Tracks [T, ...] of what is compared."""
     rows = []
     for action in actions:
-        with collector_paused():
-            states = jax.block_until_ready(step(states, action))
+        states = step(states, action)
         qpos = np.asarray(states.physics.qpos, float)
         motion = {"joint": qpos[:, env.physics.joint_qpos], "object": qpos[:, env.physics.object_qpos[:3]]}
         rows.append(motion | {name: np.asarray(getattr(states.readings, name), float) for name in READINGS})
@@ -197,7 +196,7 @@ class CheckArguments(Config):
 
     task: str = "grasp"
     """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
-    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
     """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     num_envs: int = setting(16, unit="1", low=2, high=65536)
     """Hands sampled for each range."""
@@ -233,10 +232,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if entry.environment:
         raise ConfigError(f"--task {arguments.task}: is no task on a hand: it has no randomisation to check")
     config = dataclasses.replace(entry.config(), pool_size=80)
-    env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
+    env = make(arguments.task, config, backend=arguments.backend)
     keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
-    with collector_paused():
-        states = jax.block_until_ready(jit(jax.vmap(env.reset), once=True)(keys))
+    states = jit(jax.vmap(env.reset), once=True)(keys)
     step = jit(jax.vmap(env.step), backend=env.backend)
     effects = check(env, step, states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks)
     print(f"{arguments.task} on {env.backend}, {arguments.num_envs} hands, {arguments.ticks} ticks")

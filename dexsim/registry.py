@@ -125,7 +125,6 @@ def make(
     config: EnvConfig | None = None,
     *,
     backend: str = "auto",
-    num_envs: int = 1,
     hand: Hand | None = None,
     seed: int = 0,
 ) -> Env:
@@ -135,8 +134,7 @@ def make(
     Args:
       task: a name in `TASKS`, registered ones included.
       config: the task's config dataclass; None for what the name stands for.
-      backend: physics, "auto", "jax", "cuda", "warp" or "c".
-      num_envs: batch size that Warp's contact buffers are sized for.
+      backend: physics, "auto", "c", "cuda" or "mjx".
       hand: a `Hand` from `load_hand`; None for the shipped one.
       seed: of the pool of start states.
 
@@ -151,7 +149,7 @@ def make(
             raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")
         return _make_other(task, makes)
     hand = load_hand() if hand is None else hand
-    return Env(make_task(task, hand, config), hand, backend=backend, num_envs=num_envs, seed=seed)
+    return Env(make_task(task, hand, config), hand, backend=backend, seed=seed)
 
 
 def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:

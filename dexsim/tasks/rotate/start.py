@@ -221,7 +221,7 @@ def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujo
     dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
     model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping
-    model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value  # implicit, for the motors' damping
+    model.opt.timestep = 0.005  # s; the springs are explicit here, unlike the motors of an environment
     # C MuJoCo takes shortcuts for frames that coincided when it compiled; sizes change here.
     model.geom_sameframe[:] = model.body_sameframe[:] = 0
     return model

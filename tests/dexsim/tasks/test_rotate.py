@@ -553,7 +553,7 @@ class TestReport:
 
 @pytest.fixture(scope="module")
 def rotate_env():
-    return dexsim.make("rotate", RotateConfig(pool_size=16), backend="c", num_envs=8)
+    return dexsim.make("rotate", RotateConfig(pool_size=16), backend="c")
 
 
 class TestEnvironment:
