@@ -143,17 +143,15 @@ class Safety:
                 self._pose.release()
         self._generation, self._confirmed = sample.generation, self._commanded
         measured = sample.measured
-        self.problem = (
-            self._pose.judge(sample.time, measured.joint_position, self._commanded)
-            if measured.finite()
-            else "not finite"
-        )
+        self.problem = "not finite"
+        if measured.finite():
+            self.problem = self._pose.judge(sample.time, measured.joint_position, self._commanded)
         if self.problem:
             self.counts["implausible: measurement"] += 1
             self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
             return False
         self.sample, self._wrong = sample, None
-        self._alarms.see(sample.time, measured, self._commanded is not None)
+        self._alarms.see(sample.time, measured, self._commanded)
         return True
 
     def refuse(self, refusal: Refusal | None) -> None:
@@ -212,8 +210,6 @@ class Safety:
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if request is None else request.position)
-
-    # --- pieces -----------------------------------------------------------------------------
 
     def _fatal(self) -> str:
         if self._wrong is not None and self._wrong[1] - self._wrong[0] > self.config.patience:

@@ -20,15 +20,12 @@ from dexsim.hand.source import recorded_hand
 from dexsim.observation import LayoutEntry, Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import make_observe
-from dexsim_real.core.log import Kind, LogError, LogReader, reading
+from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
 MEASURED = ("joint_position", "joint_torque", "taxel_force")
-_OTHERS = {
-    "calibrate": ("a calibration", "--from-log"),
-    "identify": ("an identification", "--identify --from-log"),
-}
+_OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
 """Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
@@ -61,81 +58,92 @@ def replay(path: Path, hand: str = "") -> Replay:
 
 
 def _replay(path: Path, hand: str) -> Replay:
-    reader = LogReader(path)
-    states: dict[int, bytes] = {}
-    times, measured, observations, notes = [], [], [], []
-    ticks: list[Any] = []
-    fields: tuple[LayoutEntry, ...] = ()
-    tares: list[tuple[int, np.ndarray]] = []  # number of the exchange from which on one holds
-    counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
-    first, meta, end = "", None, None
+    reader, run = LogReader(path), None
+    notes, end = list[str](), "truncated"
     for record in reader:
-        if record.kind == Kind.META and "from" in record.content:
-            tares.append((record.content["from"], record.content["tare"]))
-        elif record.kind == Kind.META:
-            meta = record.content
-            _check_run(path, meta)
-            sensing, observe, fields = _rebuild(meta, hand)
-            tares = [(0, sensing.tare)]
-        elif record.kind == Kind.RECEIVED:
-            number, frame = record.content
-            counts["frames"] += 1
-            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
-                states = {**{n: f for n, f in states.items() if n > number - 50}, number: frame}
-        elif record.kind == Kind.TICK and meta is not None:
-            tick = record.content
-            frame = states.get(tick["sequence"])
-            if frame is None:
-                counts["without_frame"] += 1
-                continue
-            # The exchange thread may have changed the tare before the tick's record was written.
-            sensing.tare = next(tare for begin, tare in reversed(tares) if begin <= tick["sequence"])
-            now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
-            same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)
-            # The hand's measurements are recomputed; camera, goal and command are taken from the log.
-            again = {**tick["readings"], **{name: getattr(now, name) for name in MEASURED}}
-            observation = np.asarray(observe(Readings(**again)))
-            identical = _same(observation, tick["observation"])
-            counts["readings_same"] += same
-            counts["observations_same"] += identical
-            if not (same and identical) and not first:
-                first = f"tick {len(ticks)} at {record.time:.3f} s"
-            times.append(record.time)
-            measured.append(now)
-            ticks.append(tick)
-            observations.append(observation)
+        if record.kind == Kind.META and "from" not in record.content:
+            run = _Run(path, record.content, hand)
         elif record.kind == Kind.NOTE:
             notes.append(f"{record.time:.3f} {record.content}")
         elif record.kind == Kind.END:
-            end = record.content
-    if meta is None:
+            end = record.content["end"]
+        elif run is not None:
+            run.add(record)
+    if run is None:
         raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
     report = {
         "log": str(path),
-        "task": meta["task"],
-        "policy": meta["policy"],
-        "ticks": len(ticks),
-        **counts,
-        "seconds": times[-1] - times[0] if times else 0.0,
-        "first_difference": first or None,
+        "task": run.meta["task"],
+        "policy": run.meta["policy"],
+        "ticks": len(run.ticks),
+        **run.counts,
+        "seconds": run.times[-1] - run.times[0] if run.times else 0.0,
+        "first_difference": run.first or None,
         "damaged_bytes": reader.damaged,
-        "ended": end["end"] if end else "truncated",
+        "ended": end,
         "notes": notes,
-        "recorded_on": meta["environment"],
+        "recorded_on": run.meta["environment"],
     }
-    since = np.array(times) - (times[0] if times else 0.0)
-    return Replay(report, since, measured, ticks, np.array(observations), fields, sensing.hand)
+    since = np.array(run.times) - (run.times[0] if run.times else 0.0)
+    return Replay(report, since, run.measured, run.ticks, np.array(run.observations), run.fields, run.sensing.hand)
 
 
-def _check_run(path: Path, meta: dict[str, Any]) -> None:
-    """Refuse a configuration that is not of a run."""
-    if other := _OTHERS.get(str(meta.get("task"))):
-        what, options = other
-        raise LogError(f"{path}: this is a log of {what}; `python -m dexsim_real.calibrate {options} {path}` reads it")
-    needed = ("task", "policy", "calibration", "tare", "hardware", "environment")
-    lacking = [name for name in needed if name not in meta]
-    if lacking:
-        raise LogError(f"{path}: this is not a log of a run: its configuration lacks {lacking[0]!r}")
+class _Run:
+    """Recomputes the ticks of a run from its records.
+
+    Args:
+      path: of the log.
+      meta: configuration of the run.
+      hand: see `replay`.
+    """
+
+    def __init__(self, path: Path, meta: dict[str, Any], hand: str):
+        if options := _OTHERS.get(str(meta.get("task"))):
+            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate {options} {path}` reads it")
+        self.meta = meta
+        self.sensing, self._observe, self.fields = _rebuild(meta, hand)
+        self.counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
+        self.first = ""  # difference
+        self.times, self.ticks = list[float](), list[dict[str, Any]]()
+        self.measured, self.observations = list[HandMeasurement](), list[np.ndarray]()
+        self._states: dict[int, bytes] = {}
+        self._tares = [(0, self.sensing.tare)]  # with the number of the exchange from which on one holds
+
+    def add(self, record: Record) -> None:
+        """Take in a record that is no note."""
+        content = record.content
+        if record.kind == Kind.META:
+            self._tares.append((content["from"], content["tare"]))
+        elif record.kind == Kind.RECEIVED:
+            number, frame = content
+            self.counts["frames"] += 1
+            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
+                self._states[number] = frame
+                self._states.pop(number - 50, None)
+        elif record.kind == Kind.TICK:
+            frame = self._states.get(content["sequence"])
+            if frame is None:
+                self.counts["without_frame"] += 1
+            else:
+                self._compare(record.time, content, frame)
+
+    def _compare(self, time: float, tick: dict[str, Any], frame: bytes) -> None:
+        # The exchange thread may have changed the tare before the tick's record was written.
+        self.sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
+        measured = self.sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
+        same = all(_same(getattr(measured, name), tick["readings"][name]) for name in MEASURED)
+        # The hand's measurements are recomputed; camera, goal and command are taken from the log.
+        again = {**tick["readings"], **{name: getattr(measured, name) for name in MEASURED}}
+        observation = np.asarray(self._observe(Readings(**again)))
+        identical = _same(observation, tick["observation"])
+        self.counts["readings_same"] += same
+        self.counts["observations_same"] += identical
+        if not (same and identical or self.first):
+            self.first = f"tick {len(self.ticks)} at {time:.3f} s"
+        self.times.append(time)
+        self.measured.append(measured)
+        self.ticks.append(tick)
+        self.observations.append(observation)
 
 
 def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:

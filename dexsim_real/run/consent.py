@@ -13,20 +13,13 @@ _QUESTION = (
 
 
 def check_terminal() -> None:
-    """Check that somebody can be asked.
-
-    Raises:
-      HandError: input or error output is no terminal.
-    """
+    """Raises HandError: nobody can be asked, since input or error output is no terminal."""
     if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
-        raise HandError(
-            "nobody can be asked before the motors come on, since this is no terminal; "
-            "give --yes to run without the question, or --motors-off"
-        )
+        raise HandError("no terminal, so nobody can be asked before the motors come on; give --yes or --motors-off")
 
 
 def ask() -> None:
-    """Ask on the terminal whether the motors may come on, and wait for the answer.
+    """Ask on the terminal whether the motors may come on.
 
     Raises:
       HandError: the answer is not yes.

@@ -29,10 +29,9 @@ from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.loop import LoopThread
 from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.hand_view import HandState
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.outcome import Outcome
-from dexsim_real.run.status import Status, StatusView
+from dexsim_real.run.status import HandState, Status, StatusView
 from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
@@ -85,24 +84,23 @@ class Session:
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
-    # --- stages ---------------------------------------------------------------------------------
-
     def prepare(self) -> None:
         """Connect with the motors off, tare the taxels, start camera and IMU.
 
         Raises:
           HandError: something is missing or does not answer.
         """
+        arguments, sensing = self.arguments, self.sensing
         for line in greet(self.port):
             self._note(line)
-        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+        for note in check_identity(getattr(self.port, "identity", None), sensing.hand, sensing.calibration):
             self._note(note)
-        if self.arguments.tare:
-            self._tare()
+        if arguments.tare:
+            for line in self.loop.tare():
+                self._note(f"warning: {line}")
         self._write_meta()
         self.loop.start()
         self._await_pose()
-        arguments = self.arguments
         self._policy = PolicyLoop(
             self.controller,
             self.safety,
@@ -174,7 +172,6 @@ class Session:
             "policy_compute": self.compute.summary(),
             "exchange_jitter": loop.pace.jitter.summary(),
             "round_trip": loop.round_trip.summary(),
-            "missed_for_the_hand": loop.waited,
             "link": dataclasses.asdict(self.port.counts),
             "safety": dict(safety.counts),
             "mean_finger_force": float(force),
@@ -199,11 +196,12 @@ class Session:
         if sample is None:
             return Status({"hand": safety.problem or "no measurement"})
         reaction, reason = safety.last
-        now, trip = time.monotonic(), loop.round_trip
+        now, trip, force = time.monotonic(), loop.round_trip, sample.measured.finger_force
         rows = {
             "time": f"{now - self.started if self.started else 0:.1f} s",
             "safety": f"{reaction.name.lower()} {reason}".strip(),
             "age": f"{1e3 * (now - sample.time):.1f} ms {safety.problem}".strip(),
+            "force": f"{' '.join(f'{newton:.1f}' for newton in force)} N, sum {force.sum():.1f} N",
             "policy": _timing(self.pace),
             "exchanges": _timing(loop.pace),
             "round trip": f"p50 {1e3 * trip.percentile(50):.2f} ms, p99 {1e3 * trip.percentile(99):.2f} ms",
@@ -217,23 +215,13 @@ class Session:
         target = safety.commanded if sent else self.newest.tick.target if self.newest else None
         return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
 
-    # --- pieces ---------------------------------------------------------------------------------
-
-    def _tare(self) -> None:
-        try:
-            lines = self.loop.tare()
-        except HandError as error:
-            raise HandError(f"{self.arguments.port}: {error}") from None
-        for line in lines:
-            self._note(f"warning: {line}")
-
     def _await_pose(self) -> None:
+        """Check that a hand answers plausibly now."""
         if self.loop.wait_fresh(1.0) is None:
-            self._check_loop()
-            if self.safety.problem:
-                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
-            raise HandError(f"{self.arguments.port}: {why}")
+            self.loop.check()
+            problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
+            silence = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {problem or silence}")
 
     def _await_motors(self) -> None:
         until = time.monotonic() + _STILL
@@ -246,14 +234,9 @@ class Session:
     def _check(self) -> None:
         if self.guard:
             self.guard.check()
-        self._check_loop()
+        self.loop.check()
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
-
-    def _check_loop(self) -> None:
-        if (error := self.loop.error) is not None:
-            why = error if isinstance(error, HandError) else repr(error)
-            raise HandError(f"the exchange thread failed: {why}")
 
     def _run_policy(self) -> str:
         """Tick until the time is over; returns why it ended."""
@@ -266,10 +249,9 @@ class Session:
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
             newest = self.policy.tick(now)
-            self.outcome.add(now, newest is not None, self.safety)
+            self.outcome.add(now, newest.tick.target if newest else None, self.safety)
             if newest is not None:
                 self.newest = newest
-                self.outcome.act(newest.tick.target)
                 self._log_tick(now, newest)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
@@ -278,19 +260,9 @@ class Session:
 
     def _log_tick(self, now: float, newest: PolicyTick) -> None:
         tick, sample = newest
-        readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
-        self.log.add(
-            Kind.TICK,
-            {
-                "sequence": sample.sequence,
-                "age": now - sample.time,
-                "readings": readings,
-                "observation": tick.observation,
-                "action": tick.action,
-                "target": tick.target,
-            },
-            now,
-        )
+        fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
+        fields |= {"sequence": sample.sequence, "age": now - sample.time, "readings": vars(tick.readings)}
+        self.log.add(Kind.TICK, fields, now)
 
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
@@ -314,17 +286,16 @@ class Session:
 
     def _write_meta(self) -> None:
         arguments, policy = self.arguments, self.controller.policy
-        text = arguments.calibration.read_text() if arguments.calibration else ""
-        digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params)))
+        leaves = jax.tree.leaves(policy.params)
         self.log.add(
             Kind.META,
             {
                 "task": policy.task,
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
-                "policy_sha256": digest.hexdigest(),
+                "policy_sha256": hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest(),
                 "hand": record_of(self.sensing.hand),
-                "calibration": text,
+                "calibration": arguments.calibration.read_text() if arguments.calibration else "",
                 "tare": self.sensing.tare,
                 "hardware": to_dict(arguments.hardware),
                 "safety": to_dict(self.safety.config),
