@@ -1,15 +1,7 @@
 """What the answers say about the hand's own state: heat, current, error bits, control mode, motion, refusals.
 
-| finding | reaction |
-|---|---|
-| a joint board, a fingertip or the palm board too hot, in two answers in a row | relax |
-| current too high for too long; high current without motion for longer | relax |
-| an error bit; motors that report another mode than commanded, in two answers in a row | hold; relax when it lasts |
-| a joint far from its command without current; commands that move while no angle changes | hold; relax when it lasts |
-| the hand refuses commands for a reason of its own, twice in a row | relax |
-
-The meaning of the error bits is not public, so every bit counts unless it is listed as harmless. Each finding is one
-line that names joint and finger.
+docs/hardware.md says which of them hold the hand, and which turn its motors off. The meaning of the error bits is not
+public, so every bit counts unless it is listed as harmless. Each finding is one line that names joint and finger.
 """
 
 import numpy as np
@@ -24,7 +16,7 @@ _BOARDS = ("palm", "joint", "tip")
 _STILL = 0.05  # rad, motion below which a joint with high current is stalled
 _FAR, _IDLE = 0.3, 0.15  # rad, A: so far from its command a joint draws 0.8 A, even at a fifth of the stiffness 0.16 A
 _MOVED = 0.2  # rad, motion of a command that changes some joint's angle
-_UNNOTICED = 0.4  # s for which a joint may seem not to follow: commands and answers take time
+_UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
 
 
 def joint_labels(hand: Hand) -> tuple[str, ...]:
@@ -67,7 +59,8 @@ class Alarms:
         self._harmless = np.array(config.ignored_errors, np.uint16)
         self._hot, self._current, self._error, self._off = _Timer(), _Timer(), _Timer(), _Timer()
         self._follows, self._lost = np.full(hand.num_joints, np.inf), _Timer()  # [J] s, when a joint last followed
-        self._angles: tuple[float, np.ndarray, np.ndarray] | None = None  # last change: s, [J] rad, command [J] rad
+        self._frozen = _Timer()
+        self._changed: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, angles as they changed last, command then
         self._reports_mode = False  # whether the hand has ever reported that its motors are on
         self._moved_at: np.ndarray | None = None  # [J] s, since when a joint neither moved nor had a low current
         self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, its angle then
@@ -147,11 +140,12 @@ class Alarms:
     def _deaf(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> tuple[str, float]:
         """Angles that do not follow the commands: frozen, of another joint, or of motors without power."""
         text, position = "", measured.joint_position
-        if command is None or self._angles is None or np.any(position != self._angles[1]):
-            self._angles = None if command is None else (time, position, command)
-        elif time - self._angles[0] > _UNNOTICED and np.abs(command - self._angles[2]).max() > _MOVED:
-            text = "no joint angle changes while the commands move"
         goal = position if command is None else command
+        if command is None or self._changed is None or np.any(position != self._changed[0]):
+            self._changed = position, goal
+        moved = bool(np.abs(goal - self._changed[1]).max() > _MOVED)
+        if self._frozen.lasts(time, moved) > _UNNOTICED:
+            text = "no joint angle changes while the commands move"
         away = (np.abs(goal - position) > _FAR) & (measured.current < _IDLE)
         self._follows = np.where(away, self._follows, time)
         joint = int(self._follows.argmin())

@@ -94,7 +94,7 @@ class LogWriter:
         self.close()
 
     def add(self, kind: Kind, content: Any, when: float | None = None) -> None:
-        """Queue a record. Its arrays must not change afterwards."""
+        """Queue a record of the time `when` in s, by default now. Its arrays must not change afterwards."""
         if self.failure or self._queue.qsize() > _MAX_QUEUED:
             self.dropped += 1
             return
@@ -113,10 +113,9 @@ class LogWriter:
         while True:
             last = self._stop.wait(_WAIT)
             batch = []
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    batch += self._encoded(*self._queue.get_nowait())
-                    time.sleep(0)  # Releases the interpreter lock to a waiting thread.
+            while not self._queue.empty():
+                batch += self._encoded(*self._queue.get())
+                time.sleep(0)  # Releases the interpreter lock to a waiting thread.
             try:
                 _write_all(self._file, b"".join(batch))
                 if last or time.monotonic() - synced > _FORCE:
@@ -223,10 +222,7 @@ def _content(kind: Kind, payload: bytes) -> Any:
         return (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
     if kind == Kind.NOTE:
         return payload.decode()
-    content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-    if not isinstance(content, dict):
-        raise TypeError(f"{type(content).__name__} in place of a dict")
-    return content
+    return dict(msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False))
 
 
 def _pack_array(value: Any) -> Any:

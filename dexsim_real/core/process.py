@@ -7,6 +7,7 @@ disk and terminal output below them.
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,6 +47,24 @@ def _change_priority(by: int) -> None:
     with contextlib.suppress(OSError, AttributeError):  # A priority above that of `use_realtime` may be refused.
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))
+
+
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """While modules load, Ctrl-C ends the program with one line: some modules abort, or show pages of their insides."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _leave(number: int, frame: Any) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)

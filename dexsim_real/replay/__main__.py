@@ -11,12 +11,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from dexsim.core import cli
-from dexsim.datasets.lerobot import check_lerobot, write_lerobot
-from dexsim_real.control.controller import prepare_jax
-from dexsim_real.core.errors import HandError
-from dexsim_real.replay.plots import open_rerun, plot, trajectory
-from dexsim_real.replay.replay import Replay, replay
+from dexsim_real.core.process import loading
+
+with loading():
+    from dexsim.core import cli
+    from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+    from dexsim_real.control.controller import prepare_jax
+    from dexsim_real.core.errors import HandError
+    from dexsim_real.replay.plots import plot, trajectory, write_rerun
+    from dexsim_real.replay.replay import replay
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,12 +29,9 @@ class ReplayArguments:
     log: Annotated[Path, tyro.conf.Positional]
     """Log file of `python -m dexsim_real.run`."""
     plot: Path | None = None
-    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
-    figure."""
-    rerun: bool = False
-    """Open the rerun viewer, with taxels as pictures (needs the extra `rerun`)."""
+    """Image file for a figure of angles, forces and timing (.png, .pdf or .svg); None draws no figure."""
     rrd: Path | None = None
-    """Recording for the rerun viewer, to open on another machine; None writes no file."""
+    """Recording for the rerun viewer (extra `rerun`); None writes no file."""
     lerobot: Path | None = None
     """Folder for a dataset of one episode in the LeRobot format (extra `lerobot`), which must not exist yet; None
     writes none."""
@@ -71,23 +71,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(_verdict(report))
     if arguments.output:
         cli.write_json(arguments.output, report)
-    if run.ticks:
-        _export(run, arguments)
-    return 0 if report["readings_same"] == report["observations_same"] == report["ticks"] > 0 else 1
-
-
-def _export(run: Replay, arguments: ReplayArguments) -> None:
-    if arguments.plot:
+    if run.ticks and arguments.plot:
         plot(run, arguments.plot)
-        print(f"figure: {arguments.plot}")
-    if arguments.rerun:
-        open_rerun(run)
-    if arguments.rrd:
-        open_rerun(run, arguments.rrd)
-        print(f"rerun recording: {arguments.rrd}")
-    if arguments.lerobot:
-        folder = write_lerobot(arguments.lerobot, run.hand, run.report["task"], [trajectory(run)])
-        print(f"LeRobot dataset: {folder}")
+    if run.ticks and arguments.rrd:
+        write_rerun(run, arguments.rrd)
+    if run.ticks and arguments.lerobot:
+        write_lerobot(arguments.lerobot, run.hand, report["task"], [trajectory(run)])
+    return 0 if report["readings_same"] == report["observations_same"] == report["ticks"] > 0 else 1
 
 
 def _verdict(report: dict[str, Any]) -> str:

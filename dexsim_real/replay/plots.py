@@ -1,18 +1,13 @@
 """What is made of a replayed log: a figure, the rerun viewer, a dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dexsim.datasets.rerun import show_rerun
 from dexsim.datasets.trajectory import Trajectory, from_readings
 from dexsim.hand.kinematics import Hand
-
-if TYPE_CHECKING:
-    from dexsim_real.replay.replay import Replay
+from dexsim_real.replay.replay import Replay
 
 
 def signals(run: Replay) -> dict[str, np.ndarray]:
@@ -59,12 +54,8 @@ def finger_joints(hand: Hand, finger: int) -> list[int]:
     return list(dict.fromkeys(joints[::-1]))  # a motor may move two
 
 
-def open_rerun(run: Replay, path: Path | None = None) -> None:
-    """Show a replay in the rerun viewer: the signals, the observation by fields, and taxels as pictures.
-
-    Args:
-      run: the replay.
-      path: recording to write; None opens the viewer.
+def write_rerun(run: Replay, path: Path) -> None:
+    """Write a recording for the rerun viewer: the signals, the observation by fields, and taxels as pictures.
 
     Raises:
       DexsimError: rerun is not installed.

@@ -8,9 +8,8 @@ from dexsim.core import cli
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
-from dexsim_real.run import consent
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.session import Session
+from dexsim_real.run.session import Session, check_terminal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +54,7 @@ def run_policy(
 def execute(arguments: RunArguments) -> RunResult:
     """Run with these options, within `stopping`; see `run_policy`."""
     if not (arguments.yes or arguments.motors_off):
-        consent.check_terminal()
+        check_terminal()
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)

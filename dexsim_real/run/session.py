@@ -1,9 +1,11 @@
 """A run on the hand: connect, tare, approach, run the policy, and end with the motors off."""
 
+import contextlib
 import dataclasses
 import gc
 import hashlib
 import sys
+import termios
 import time
 from pathlib import Path
 from typing import Any
@@ -27,11 +29,10 @@ from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.loop import LoopThread
-from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.outcome import Outcome
-from dexsim_real.run.status import HandState, Status, StatusView
+from dexsim_real.run.status import HandState, StatusView
 from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
@@ -42,6 +43,10 @@ from dexsim_real.wire.link import greet
 from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
+_QUESTION = (
+    "The motors come on at this pose, then the hand moves to its start posture.\n"
+    "Is the power switch within reach, and the hand's room clear? [y/N] "
+)
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 
 
@@ -74,7 +79,7 @@ class Session:
         beat = self.guard.beat if self.guard else lambda more: None
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
         self.loop.retared = self._retare
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self.status, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
         self._policy: PolicyLoop | None = None  # from `prepare` on
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = 0.0
@@ -119,7 +124,7 @@ class Session:
         """
         if not (self.arguments.yes or self.arguments.motors_off):
             self.view.show()
-            consent.ask()
+            ask()
             self._await_pose()  # The hand may have been moved or lost meanwhile.
         sys.setswitchinterval(2e-4)
         gc.collect()
@@ -160,21 +165,23 @@ class Session:
         self._closed = True
 
     def summary(self) -> dict[str, Any]:
-        """Results and statistics of the run; JSON-able."""
+        """Results and statistics of the run so far; JSON-able."""
         loop, safety, policy = self.loop, self.safety, self._policy
-        force = policy.finger_force.sum() / max(policy.ticks, 1) if policy else 0.0
+        reaction, reason = safety.last
         summary = {
             "end": self.end,
             "motors_off": not loop.driven,
             "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
             "command": self.arguments.command,
+            "reaction": f"{reaction.name.lower()} {reason}".strip(),
+            "problem": safety.problem,
+            "safety": dict(safety.counts),
+            "mean_finger_force": float(policy.finger_force.sum() / max(policy.ticks, 1)) if policy else 0.0,
             "policy_jitter": self.pace.jitter.summary(),
             "policy_compute": self.compute.summary(),
             "exchange_jitter": loop.pace.jitter.summary(),
             "round_trip": loop.round_trip.summary(),
             "link": dataclasses.asdict(self.port.counts),
-            "safety": dict(safety.counts),
-            "mean_finger_force": float(force),
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
             "missing": self.outcome.missing(self.log),
@@ -190,30 +197,13 @@ class Session:
         assert self._policy is not None, "`prepare` comes first"
         return self._policy
 
-    def status(self) -> Status:
-        """The state of the run in words; called from the view's thread."""
-        safety, loop, counts, sample = self.safety, self.loop, self.port.counts, self.safety.sample
+    def hand_state(self) -> HandState | None:
+        """What the view shows of the hand; None without a measurement. Called from the view's thread."""
+        sample, sent = self.safety.sample, self.safety.last[0] != Reaction.RELAX
         if sample is None:
-            return Status({"hand": safety.problem or "no measurement"})
-        reaction, reason = safety.last
-        now, trip, force = time.monotonic(), loop.round_trip, sample.measured.finger_force
-        rows = {
-            "time": f"{now - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (now - sample.time):.1f} ms {safety.problem}".strip(),
-            "force": f"{' '.join(f'{newton:.1f}' for newton in force)} N, sum {force.sum():.1f} N",
-            "policy": _timing(self.pace),
-            "exchanges": _timing(loop.pace),
-            "round trip": f"p50 {1e3 * trip.percentile(50):.2f} ms, p99 {1e3 * trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-            f"{counts.late} late, {counts.reconnects} reconnects",
-            "command": f"{self.arguments.command:.2f}",
-        }
-        if self._policy and self._policy.goals:
-            rows["successes"] = str(self._policy.goals.successes)
-        sent = reaction != Reaction.RELAX
-        target = safety.commanded if sent else self.newest.tick.target if self.newest else None
-        return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
+            return None
+        target = self.safety.commanded if sent else self.newest.tick.target if self.newest else None
+        return HandState(self.sensing.hand, sample.measured, target, sent)
 
     def _await_pose(self) -> None:
         """Check that a hand answers plausibly now."""
@@ -307,6 +297,25 @@ class Session:
         )
 
 
+def check_terminal() -> None:
+    """Raises HandError: nobody can be asked, since input or error output is no terminal."""
+    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+        raise HandError("no terminal, so nobody can be asked before the motors come on; give --yes or --motors-off")
+
+
+def ask() -> None:
+    """Ask on the terminal whether the motors may come on.
+
+    Raises:
+      HandError: the answer is not yes.
+    """
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # What was typed before the question is no answer to it.
+    print(_QUESTION, end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise HandError("the answer was not yes: the motors stayed off")
+
+
 def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSensors:
     """Open the camera and the IMU of a run.
 
@@ -330,13 +339,3 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     except BaseException:
         ObjectSensors(reference, camera, imu).close()
         raise
-
-
-def _timing(pace: Pace) -> str:
-    timing = pace.jitter
-    if not timing.count:
-        return f"{1 / pace.period:.1f} Hz"
-    return (
-        f"{1 / pace.period:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-        f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
-    )

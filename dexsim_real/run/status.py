@@ -5,7 +5,7 @@ import dataclasses
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO, cast
 
 import numpy as np
@@ -32,14 +32,6 @@ class HandState:
     sent: bool  # whether the motors follow them
 
 
-@dataclasses.dataclass(frozen=True)
-class Status:
-    """The state of a run."""
-
-    rows: dict[str, str]  # name to text
-    hand: HandState | None = None  # None without a measurement
-
-
 class _Lasting:
     """A stream to which writing never fails: a terminal that was closed, or a pipe without a reader, ends no run."""
 
@@ -60,17 +52,24 @@ class _Lasting:
 
 
 class StatusView:
-    """Shows `status()` from a background thread. A context manager.
+    """Shows the state of a run from a background thread. A context manager.
 
     Args:
       title: of the tables.
-      status: the current state; called from the background thread, and by `show`.
+      summary: results so far; called from the background thread, and by `show`, like the next.
+      hand: the state of the hand; None without a measurement.
       quiet: show nothing.
     """
 
-    def __init__(self, title: str, status: Callable[[], Status], quiet: bool = False):
+    def __init__(
+        self,
+        title: str,
+        summary: Callable[[], dict[str, Any]],
+        hand: Callable[[], HandState | None],
+        quiet: bool = False,
+    ):
         self.console = _console(quiet)
-        self._title, self._status = title, status
+        self._title, self._summary, self._hand = title, summary, hand
         live = self.console.is_terminal and not quiet
         self._live = Live(console=self.console, auto_refresh=False, transient=True) if live else None
         self._notes: deque[str] = deque(maxlen=1000)
@@ -97,7 +96,7 @@ class StatusView:
 
     def show(self) -> None:
         """Print the tables once."""
-        self.console.print(self._tables(self._status()))
+        self.console.print(self._tables())
 
     def _print_notes(self) -> None:
         with contextlib.suppress(IndexError):  # Another thread may have printed the last one.
@@ -111,28 +110,37 @@ class StatusView:
             self._print_notes()
             elapsed += _LIVE
             if self._live:
-                self._live.update(self._tables(self._status()), refresh=True)
+                self._live.update(self._tables(), refresh=True)
             elif elapsed >= _LINES:
                 elapsed = 0.0
-                self._notes.append(" | ".join(f"{name} {text}" for name, text in self._status().rows.items()))
+                self._notes.append(" | ".join(f"{name} {text}" for name, text in _texts(self._summary())))
         self._print_notes()
 
-    def _tables(self, status: Status) -> Group:
-        rows = Table.grid(padding=(0, 2))
-        for row in status.rows.items():
-            rows.add_row(*map(escape, row))
-        return Group(escape(self._title), *([_hand_tables(status.hand)] if status.hand else []), "", rows)
+    def _tables(self) -> Group:
+        state = self._hand()
+        return Group(*([_hand_tables(state)] if state else []), "", _rows(self._title, self._summary()))
 
 
 def show_summary(title: str, summary: dict[str, Any]) -> None:
     """Print nested results as a table on the standard error."""
+    _console().print(_rows(title, summary))
+
+
+def _rows(title: str, summary: dict[str, Any]) -> Table:
     # Escaped, since an error may have text in brackets, which Rich would take for its markup.
-    table = Table("measure", "value", title=escape(title), title_justify="left")
+    table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
+    for name, text in _texts(summary):
+        table.add_row(name, escape(text))
+    return table
+
+
+def _texts(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and text of each entry that says something."""
     for name, value in summary.items():
         if isinstance(value, dict):
             value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v)
-        table.add_row(name.replace("_", " "), escape(_short(value)))
-    _console().print(table)
+        if value not in ("", []):
+            yield name.replace("_", " "), _short(value)
 
 
 def _hand_tables(state: HandState) -> Table:

@@ -159,10 +159,7 @@ class Parser:
 
     A header is valid only with a known command and a length that this command can have; then the checksum decides.
     When it fails, the search continues one byte after that header, so every intact frame of the stream is found.
-    A false header delays the next frame by at most one frame.
-
-    Memory is bounded by one frame and one chunk. Each byte is searched once for the head, and enters the checksum at
-    most once for each valid header in the longest frame before it.
+    Memory is bounded by one frame and one chunk.
 
     Args:
       lengths: possible data lengths of each command, `HAND_REPLIES` or `HOST_REQUESTS`.

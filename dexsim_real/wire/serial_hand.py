@@ -17,7 +17,7 @@ from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
-from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply, check_port
+from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
 from dexsim_real.wire.refusals import Refusal, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
@@ -310,14 +310,12 @@ def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] |
       tap: see `SerialHand`.
 
     Raises:
-      HandError: the module or function cannot be found, or it returned no `HandPort`.
+      HandError: the module or function cannot be found.
     """
     if not spec.startswith("sdk:"):
         return SerialHand(spec, config, tap=tap)
     form = "sdk:MODULE:FUNCTION of an importable module"
-    port = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
-    check_port(port, spec)
-    return port
+    return find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
 
 
 def _printable(data: bytes) -> str:
