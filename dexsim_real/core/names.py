@@ -22,4 +22,5 @@ def find_function(name: str, given: str, form: str, default: str = "") -> Callab
     try:
         return getattr(importlib.import_module(module), function or default)
     except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
-        raise HandError(f"{given}: {type(error).__name__}: {' '.join(str(error).split()):.200}; give {form}") from None
+        kind = "" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: "
+        raise HandError(f"{given}: {kind}{' '.join(str(error).split()):.200}".rstrip(": ") + f"; give {form}") from None
