@@ -13,29 +13,19 @@ if TYPE_CHECKING:
     from dexsim_real.control.limits import SafetyConfig
     from dexsim_real.control.safety import Safety
     from dexsim_real.core.errors import HandError
-    from dexsim_real.core.log import LogReader, LogWriter
     from dexsim_real.run.result import RunResult, run_policy
-    from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
-    from dexsim_real.sensors.readings import ObjectEstimate, make_readings
     from dexsim_real.wire.link import HandPort, LinkConfig
     from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 __all__ = [
     "Controller",
     "HandError",
-    "HandMeasurement",
     "HandPort",
-    "HandSensing",
-    "HardwareConfig",
     "LinkConfig",
-    "LogReader",
-    "LogWriter",
-    "ObjectEstimate",
     "RunResult",
     "Safety",
     "SafetyConfig",
     "SerialHand",
-    "make_readings",
     "open_port",
     "run_policy",
 ]
@@ -46,19 +36,12 @@ __getattr__, __dir__ = open_door(
     {
         "Controller": "dexsim_real.control.controller",
         "HandError": "dexsim_real.core.errors",
-        "HandMeasurement": "dexsim_real.sensors.hand",
         "HandPort": "dexsim_real.wire.link",
-        "HandSensing": "dexsim_real.sensors.hand",
-        "HardwareConfig": "dexsim_real.sensors.hand",
         "LinkConfig": "dexsim_real.wire.link",
-        "LogReader": "dexsim_real.core.log",
-        "LogWriter": "dexsim_real.core.log",
-        "ObjectEstimate": "dexsim_real.sensors.readings",
         "RunResult": "dexsim_real.run.result",
         "Safety": "dexsim_real.control.safety",
         "SafetyConfig": "dexsim_real.control.limits",
         "SerialHand": "dexsim_real.wire.serial_hand",
-        "make_readings": "dexsim_real.sensors.readings",
         "open_port": "dexsim_real.wire.serial_hand",
         "run_policy": "dexsim_real.run.result",
     },

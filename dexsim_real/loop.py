@@ -67,7 +67,6 @@ class ExchangeLoop:
         self.pace, self._beat = Pace(rate, clock, sleep), beat
         self.round_trip = Timing()
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
-        self._took = 0.0  # s, duration of the last exchange on the wire
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self.track_taxels = track_taxels
         self._filter = VelocityFilter(sensing.config.velocity_time)
@@ -82,10 +81,7 @@ class ExchangeLoop:
         """One exchange; None without an answer."""
         self._beat(0.0)
         decision, command = self.request()
-        sent = self.clock()
-        reply = self.port.exchange(command)
-        self._took = self.clock() - sent
-        return self.take(decision, reply)
+        return self.take(decision, self.port.exchange(command))
 
     def request(self) -> tuple[SafetyDecision, np.ndarray]:
         """What to send now, and its `frames.COMMAND_BLOCK`."""
@@ -179,7 +175,6 @@ class LoopThread(ExchangeLoop):
         clock: Callable[[], float] = time.monotonic,
     ):
         super().__init__(port, sensing, safety, rate, beat, clock=clock)
-        self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self._stop, self._fresh = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="exchange", daemon=True)
@@ -187,13 +182,15 @@ class LoopThread(ExchangeLoop):
     def start(self) -> None:
         self._thread.start()
 
-    def alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread.is_alive()
+    def check(self) -> None:
+        """Raises HandError: the thread has ended with an error."""
+        if self.error is not None:
+            why = self.error if isinstance(self.error, HandError) else repr(self.error)
+            raise HandError(f"the exchange thread failed: {why}")
 
     def forget(self) -> None:
         """Reset the timing statistics, to exclude the start."""
-        self.pace.jitter, self.round_trip, self.waited = Timing(), Timing(), 0
+        self.pace.jitter, self.round_trip = Timing(), Timing()
 
     def free(self, now: float) -> float:
         """The next time s at which a request has just been sent and the interpreter is idle until its answer."""
@@ -219,16 +216,10 @@ class LoopThread(ExchangeLoop):
         try:
             self.pace.next = self.clock() + self.pace.period
             while not self._stop.is_set():
-                due = self.pace.next - self.pace.period
                 exchange = self.cycle()
                 if exchange is not None and exchange.plausible:
                     self._fresh.set()
-                own, missed = self.clock() - due - self._took, self.pace.jitter.missed
                 self.pace.wait()
-                missed = self.pace.jitter.missed - missed
-                # A usual answer would have left enough time: the hand was late, not the bridge.
-                if missed and own + self.round_trip.percentile(50) < self.pace.period:
-                    self.waited += missed
         except BaseException as error:  # The main thread reports it.
             self.error = error
         finally:

@@ -17,8 +17,7 @@ NAMES = {
         CurriculumConfig PPOConfig Policy TrainResult TrainState act evaluate_policy load_policy make_train train_policy
     """,
     "dexsim_real": """
-        Controller HandError HandMeasurement HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter
-        ObjectEstimate RunResult Safety SafetyConfig SerialHand make_readings open_port run_policy
+        Controller HandError HandPort LinkConfig RunResult Safety SafetyConfig SerialHand open_port run_policy
     """,
 }
 

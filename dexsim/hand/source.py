@@ -46,7 +46,8 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
     if not given:
         if record is None:
             return None
-        if not find_hand(record["file"]).is_file():
+        path = find_hand(record["file"])
+        if path.suffix != ".toml" or not path.is_file():  # Nothing else is opened, whatever a policy's file names.
             raise ConfigError(f"{what} is of the hand {_name(record)}, which is not here: give --hand FILE")
         hand = load_hand(record["file"])
         check_same(record, hand, what)

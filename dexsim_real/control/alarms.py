@@ -1,14 +1,7 @@
-"""What the hand says about its own state: heat, current, error bits, control mode, refused commands.
+"""What the answers say about the hand's own state: heat, current, error bits, control mode, motion, refusals.
 
-| finding | reaction |
-|---|---|
-| a joint board, a fingertip or the palm board too hot, in two answers in a row | relax |
-| current too high for too long; high current without motion for longer | relax |
-| an error bit; motors that report another mode than commanded, in two answers in a row | hold; relax when it lasts |
-| the hand refuses commands for a reason of its own, twice in a row | relax |
-
-The meaning of the error bits is not public, so every bit counts unless it is listed as harmless. Each finding is one
-line that names joint and finger.
+docs/hardware.md says which of them hold the hand, and which turn its motors off. The meaning of the error bits is not
+public, so every bit counts unless it is listed as harmless. Each finding is one line that names joint and finger.
 """
 
 import numpy as np
@@ -21,6 +14,9 @@ from dexsim_real.wire.refusals import Refusal
 
 _BOARDS = ("palm", "joint", "tip")
 _STILL = 0.05  # rad, motion below which a joint with high current is stalled
+_FAR, _IDLE = 0.3, 0.15  # rad, A: so far from its command a joint draws 0.8 A, even at a fifth of the stiffness 0.16 A
+_MOVED = 0.2  # rad, motion of a command that changes some joint's angle
+_UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
 
 
 def joint_labels(hand: Hand) -> tuple[str, ...]:
@@ -62,22 +58,29 @@ class Alarms:
         self._parts = (*self._joints, *(f"fingertip of the {name}" for name in hand.finger_names), "palm board")
         self._harmless = np.array(config.ignored_errors, np.uint16)
         self._hot, self._current, self._error, self._off = _Timer(), _Timer(), _Timer(), _Timer()
+        self._follows, self._lost = np.full(hand.num_joints, np.inf), _Timer()  # [J] s, when a joint last followed
+        self._frozen = _Timer()
+        self._changed: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, angles as they changed last, command then
         self._reports_mode = False  # whether the hand has ever reported that its motors are on
         self._moved_at: np.ndarray | None = None  # [J] s, since when a joint neither moved nor had a low current
         self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, its angle then
         self._serious = 0  # serious refusals in a row
 
-    def see(self, time: float, measured: HandMeasurement, on: bool) -> None:
+    def see(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
         """Judge an answer.
 
         Args:
           time: s of the answer.
           measured: what it contains.
-          on: whether the motors were commanded to be on.
+          command: [J] rad; None with the motors off.
         """
         self.refused, self._serious = "", 0
         sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
-        waiting = (self._errors(time, measured), self._switched_off(time, measured, on))
+        waiting = (
+            self._errors(time, measured),
+            self._switched_off(time, measured, command is not None),
+            self._deaf(time, measured, command),
+        )
         limit = self.config.alarm_seconds
         self.fatal = next(filter(None, sudden), "") or next((text for text, lasts in waiting if lasts > limit), "")
         self.hold = next((text for text, lasts in waiting if text), "")
@@ -100,10 +103,8 @@ class Alarms:
 
     def _overcurrent(self, time: float, measured: HandMeasurement) -> str:
         joint = int(measured.current.argmax())
-        if (
-            self._current.lasts(time, bool(measured.current[joint] > self.config.current))
-            <= self.config.current_seconds
-        ):
+        lasts = self._current.lasts(time, bool(measured.current[joint] > self.config.current))
+        if lasts <= self.config.current_seconds:
             return ""
         return f"current too high: {measured.current[joint]:.2f} A in {self._joints[joint]}"
 
@@ -135,3 +136,22 @@ class Alarms:
         joint = int(off.argmax())
         which = "all joints report" if off.all() else f"{self._joints[joint]} reports"
         return f"the hand switched itself off: {which} mode {measured.mode[joint]}", lasts
+
+    def _deaf(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> tuple[str, float]:
+        """Angles that do not follow the commands: frozen, of another joint, or of motors without power."""
+        text, position = "", measured.joint_position
+        goal = position if command is None else command
+        if command is None or self._changed is None or np.any(position != self._changed[0]):
+            self._changed = position, goal
+        moved = bool(np.abs(goal - self._changed[1]).max() > _MOVED)
+        if self._frozen.lasts(time, moved) > _UNNOTICED:
+            text = "no joint angle changes while the commands move"
+        away = (np.abs(goal - position) > _FAR) & (measured.current < _IDLE)
+        self._follows = np.where(away, self._follows, time)
+        joint = int(self._follows.argmin())
+        if not text and time - self._follows[joint] > _UNNOTICED:
+            text = (
+                f"{self._joints[joint]} does not follow its command: "
+                f"at {position[joint]:.2f} rad, commanded to {goal[joint]:.2f} rad"
+            )
+        return text, self._lost.lasts(time, bool(text))

@@ -100,8 +100,7 @@ class Controller:
         self.carry = self.policy.initial_carry()
 
     def resume(self, position: np.ndarray) -> None:
-        """Continue from this pose [J] rad after a hold, perhaps with the object put back: what came before is
-        forgotten."""
+        """Continue from this pose [J] rad after a hold, perhaps with the object put back: the past is forgotten."""
         self.anchor(position)
         self.carry = self.policy.initial_carry()
 

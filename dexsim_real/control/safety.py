@@ -1,15 +1,7 @@
-"""Safety limits between a policy and the motors, each with one defined reaction.
+"""Safety limits between a policy and the motors, each with one defined reaction (the table in docs/hardware.md).
 
 `Safety` decides once a cycle which command is sent. It has no clock of its own: measurements and joint targets carry
 their times, so any course of events can be tested.
-
-| finding | reaction |
-|---|---|
-| joint target outside position, speed or reach limits | clip |
-| joint target not finite; joint too fast; fingertip force too high; target or measurement too old | hold |
-| targets or measurements (also of the object) missing for long | relax |
-| measured angles that cannot be true (`PoseCheck`) | no measurement; relax permanently when they last |
-| alarms of the hand itself (`Alarms`): heat, current, error bits, motors off, refusals | hold, relax permanently |
 
 Hold: the last command that the hand confirmed, at the usual gains; when the force is too high, slowly toward the
 measured pose, but never far from where it was as the hold began. A hold ends after some seconds with the motors off.
@@ -30,6 +22,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
+from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.refusals import Refusal
@@ -99,6 +92,8 @@ class Safety:
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
         self.config, self._note = config, note
         self._stops = hand.joint_lower.astype(np.float32), hand.joint_upper.astype(np.float32)
+        if not np.max(np.abs(self._stops)) <= 2 * np.pi:
+            raise HandError(f"{hand.name}: a joint's limits are beyond a turn; check the hand's model")
         # At most half of a joint's range: beyond that the limits would change sides.
         margin = np.minimum(np.float32(config.margin), (self._stops[1] - self._stops[0]) / 2)
         self._slow = min(config.slow_speed, config.speed)  # rad/s
@@ -143,17 +138,15 @@ class Safety:
                 self._pose.release()
         self._generation, self._confirmed = sample.generation, self._commanded
         measured = sample.measured
-        self.problem = (
-            self._pose.judge(sample.time, measured.joint_position, self._commanded)
-            if measured.finite()
-            else "not finite"
-        )
+        self.problem = "not finite"
+        if measured.finite():
+            self.problem = self._pose.judge(sample.time, measured.joint_position, self._commanded)
         if self.problem:
             self.counts["implausible: measurement"] += 1
             self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
             return False
         self.sample, self._wrong = sample, None
-        self._alarms.see(sample.time, measured, self._commanded is not None)
+        self._alarms.see(sample.time, measured, self._commanded)
         return True
 
     def refuse(self, refusal: Refusal | None) -> None:
@@ -212,8 +205,6 @@ class Safety:
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if request is None else request.position)
-
-    # --- pieces -----------------------------------------------------------------------------
 
     def _fatal(self) -> str:
         if self._wrong is not None and self._wrong[1] - self._wrong[0] > self.config.patience:

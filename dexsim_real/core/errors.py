@@ -23,10 +23,8 @@ def explain(port: str, error: Exception) -> str:
     """One line about a port that does not open: the reason and the remedy."""
     number = getattr(error, "errno", None)
     if number == errno.EACCES:
-        return (
-            f"{port}: permission denied. It belongs to the group {_group(port)!r}: run "
-            f"`sudo usermod -aG {_group(port)} $USER`, then log out and in again"
-        )
+        group = grp.getgrgid(os.stat(port).st_gid).gr_name
+        return f"{port}: permission denied; run `sudo usermod -aG {group} $USER`, then log out and in again"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: another program has it open (`fuser -v {port}` names it). Close that program first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
@@ -38,12 +36,8 @@ def explain(port: str, error: Exception) -> str:
 
 def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices")) -> list[str]:
     """Warn of an FTDI adapter whose latency timer exceeds 1 ms: at the usual 16 ms the loop runs at half its rate."""
-    name = os.path.basename(os.path.realpath(port))
-    timer = sysfs / name / "latency_timer"
-    try:
-        value = int(timer.read_text())
-    except (OSError, ValueError):
-        return []
+    timer = sysfs / os.path.basename(os.path.realpath(port)) / "latency_timer"
+    value = int(timer.read_text()) if timer.is_file() else 0
     if value <= 1:
         return []
     return [
@@ -51,10 +45,3 @@ def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices"
         f"`echo 1 | sudo tee {timer}`. Set it permanently in /etc/udev/rules.d/99-dexsim.rules: "
         'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
     ]
-
-
-def _group(port: str) -> str:
-    try:
-        return grp.getgrgid(os.stat(port).st_gid).gr_name
-    except (OSError, KeyError):
-        return "dialout"

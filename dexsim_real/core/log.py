@@ -2,9 +2,8 @@
 
     DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
 
-A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file
-is synced to the disk. A truncated or damaged record costs only itself; one with a right checksum whose payload cannot
-be read counts as damaged, too.
+A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file is synced to
+the disk. A truncated or damaged record costs only itself.
 """
 
 import contextlib
@@ -34,6 +33,7 @@ _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
 _LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
+_CHECKED = 4  # checksums over one byte of a log, on average; 1 without damage
 
 
 class LogError(DexsimError):
@@ -49,6 +49,9 @@ class Kind(enum.IntEnum):
     TICK = 4  # readings, observation, action and joint target of one control tick
     NOTE = 5  # one line of text
     END = 6  # summary
+
+
+_KINDS = frozenset(Kind)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +94,7 @@ class LogWriter:
         self.close()
 
     def add(self, kind: Kind, content: Any, when: float | None = None) -> None:
-        """Queue a record. Its arrays must not change afterwards."""
+        """Queue a record of the time `when` in s, by default now. Its arrays must not change afterwards."""
         if self.failure or self._queue.qsize() > _MAX_QUEUED:
             self.dropped += 1
             return
@@ -110,10 +113,9 @@ class LogWriter:
         while True:
             last = self._stop.wait(_WAIT)
             batch = []
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    batch += self._encoded(*self._queue.get_nowait())
-                    time.sleep(0)  # Releases the interpreter lock to a waiting thread.
+            while not self._queue.empty():
+                batch += self._encoded(*self._queue.get())
+                time.sleep(0)  # Releases the interpreter lock to a waiting thread.
             try:
                 _write_all(self._file, b"".join(batch))
                 if last or time.monotonic() - synced > _FORCE:
@@ -126,10 +128,9 @@ class LogWriter:
                 return
 
     def _encoded(self, kind: Kind, when: float, content: Any) -> list[bytes]:
-        """The bytes of a record; none if it cannot be written, which must not end the thread."""
         try:
             return [encode(kind, when, content)]
-        except Exception as error:
+        except Exception as error:  # It must not end the thread.
             self.failure = f"{self.path}: a {kind.name} record cannot be written ({error})"
             self.dropped += 1
             return []
@@ -151,7 +152,7 @@ class LogReader:
     """Iterates over the intact records of a log; `damaged` counts the bytes skipped so far.
 
     Raises:
-      LogError: the file is missing, or is not a log.
+      LogError: the file is missing, is not a log, or has more false heads than damage explains.
     """
 
     def __init__(self, path: str | Path):
@@ -165,8 +166,13 @@ class LogReader:
 
     def __iter__(self) -> Iterator[Record]:
         at, data, self.damaged = len(MAGIC), self._data, 0
+        # A false head costs a checksum over all that it claims: without a bound a forged file would cost its square.
+        left = _CHECKED * len(data) + _LONGEST
         while at < len(data):
-            record, size = _decode(data, at)
+            record, size, checked = _decode(data, at)
+            left -= checked
+            if left < 0:
+                raise LogError(f"{self.path}: nearly all of it is damaged; record again")
             if record is None:
                 following = data.find(SYNC, at + 1)
                 following = len(data) if following < 0 else following
@@ -179,7 +185,7 @@ class LogReader:
 
 @contextlib.contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Within this context a record that is intact, and yet not as the bridge writes it, is refused in one line.
+    """Turn the error of a reader about a record of unexpected content into one line.
 
     Raises:
       LogError: there is such a record.
@@ -188,40 +194,35 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except DexsimError:
         raise
-    except Exception as error:  # Whatever stands in a forged record, its reader raises another one.
+    except Exception as error:
         raise LogError(
             f"{path}: a record is not as the bridge writes it ({type(error).__name__}: {error}); record again"
         ) from error
 
 
-def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
+def _decode(data: bytes, at: int) -> tuple[Record | None, int, int]:
+    """The record that begins here, its size, and the number of bytes under the checksum."""
     if at + _HEAD.size > len(data):
-        return None, 0
+        return None, 0, 0
     sync, kind, when, length, check = _HEAD.unpack_from(data, at)
-    # The length first: the checksum of a long payload takes long, and a damaged file may have many such heads.
-    if sync != SYNC or length > _LONGEST or kind not in set(Kind):
-        return None, 0
-    payload = data[at + _HEAD.size : at + _HEAD.size + length]
-    if len(payload) != length:
-        return None, 0
+    end = at + _HEAD.size + length
+    if sync != SYNC or length > _LONGEST or end > len(data) or kind not in _KINDS:
+        return None, 0, 0
+    payload = data[at + _HEAD.size : end]
     if zlib.crc32(payload, zlib.crc32(_HEAD.pack(sync, kind, when, length, 0))) != check:
-        return None, 0
+        return None, 0, length
     try:
-        return Record(Kind(kind), when, _content(Kind(kind), payload)), _HEAD.size + length
+        return Record(Kind(kind), when, _content(Kind(kind), payload)), end - at, length
     except Exception:  # A checksum can be forged; msgpack, struct and NumPy each raise their own.
-        return None, 0
+        return None, 0, length
 
 
 def _content(kind: Kind, payload: bytes) -> Any:
-    """The content of a record; bytes that are none raise any error."""
     if kind in (Kind.SENT, Kind.RECEIVED):
         return (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
     if kind == Kind.NOTE:
         return payload.decode()
-    content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-    if not isinstance(content, dict):
-        raise TypeError(f"{type(content).__name__} in place of a dict")
-    return content
+    return dict(msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False))
 
 
 def _pack_array(value: Any) -> Any:

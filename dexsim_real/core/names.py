@@ -16,16 +16,11 @@ def find_function(name: str, given: str, form: str, default: str = "") -> Callab
       form: what to give, for the error.
 
     Raises:
-      HandError: no such module or function, it is no function, or the module fails when it is imported.
+      HandError: no such module or function, or the module fails when it is imported.
     """
     module, _, function = name.partition(":")
     try:
-        function_object = getattr(importlib.import_module(module), function or default)
+        return getattr(importlib.import_module(module), function or default)
     except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
-        says = " ".join(str(error).split())
-        if not isinstance(error, (ImportError, AttributeError)):
-            says = f"{type(error).__name__}: {says}".removesuffix(": ")
-        raise HandError(f"{given}: {says:.200}; give {form}") from None
-    if not callable(function_object):
-        raise HandError(f"{given}: {function or default} is no function; give {form}")
-    return function_object
+        kind = "" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: "
+        raise HandError(f"{given}: {kind}{' '.join(str(error).split()):.200}".rstrip(": ") + f"; give {form}") from None

@@ -7,6 +7,7 @@ disk and terminal output below them.
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,12 +16,9 @@ _STEP = 5
 
 
 def use_realtime() -> bool:
-    """Request real-time priority for this thread and those that it starts.
+    """Request real-time priority for this thread and those that it starts; returns whether it was granted.
 
     All threads of the bridge need it, since they share one interpreter lock.
-
-    Returns:
-      Whether it was granted (docs/hardware.md says how to allow it).
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
@@ -41,10 +39,7 @@ def raise_priority() -> None:
 
 
 def lower_priority() -> None:
-    """Run this thread after the bridge's others, still before ordinary programs.
-
-    No effect without real-time priority.
-    """
+    """Run this thread after the bridge's others. No effect without real-time priority."""
     _change_priority(-_STEP)
 
 
@@ -54,7 +49,25 @@ def _change_priority(by: int) -> None:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))
 
 
-_ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """While modules load, Ctrl-C ends the program with one line: some modules abort, or show pages of their insides."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _leave(number: int, frame: Any) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 _armed = False  # whether a signal may still interrupt the program
 _interrupted = False  # whether one has
 
@@ -71,8 +84,7 @@ def stopping(leaving: bool = False) -> Iterator[None]:
     late one would kill it before its exit code is given.
     """
     global _armed, _interrupted
-    numbers = [signal.SIGINT, *(getattr(signal, name) for name in _ENDING if hasattr(signal, name))]
-    before = {number: signal.signal(number, _interrupt) for number in numbers}
+    before = {number: signal.signal(number, _interrupt) for number in _SIGNALS}
     _armed, _interrupted = True, False
     try:
         yield

@@ -17,7 +17,6 @@ class Timing:
         self.count, self.missed, self.worst = 0, 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """Add a sample in s."""
         self._bins[min(int(max(seconds, 0.0) / self._BIN), self._BINS)] += 1
         self.count += 1
         self.worst = max(self.worst, seconds)
@@ -44,12 +43,7 @@ GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
 
 class Pace:
-    """Absolute deadlines `start + k / rate`, so a slow cycle does not shift the next one.
-
-    Args:
-      rate: Hz.
-      clock, sleep: replace those of `time`, for simulated time.
-    """
+    """Absolute deadlines `start + k / rate`, rate in Hz, so a slow cycle does not shift the next one."""
 
     def __init__(
         self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep

@@ -11,12 +11,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from dexsim.core import cli
-from dexsim.datasets.lerobot import check_lerobot, write_lerobot
-from dexsim_real.control.controller import prepare_jax
-from dexsim_real.core.errors import HandError
-from dexsim_real.replay.plots import open_rerun, plot, trajectory
-from dexsim_real.replay.replay import replay
+from dexsim_real.core.process import loading
+
+with loading():
+    from dexsim.core import cli
+    from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+    from dexsim_real.control.controller import prepare_jax
+    from dexsim_real.core.errors import HandError
+    from dexsim_real.replay.plots import plot, trajectory, write_rerun
+    from dexsim_real.replay.replay import replay
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,12 +29,9 @@ class ReplayArguments:
     log: Annotated[Path, tyro.conf.Positional]
     """Log file of `python -m dexsim_real.run`."""
     plot: Path | None = None
-    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
-    figure."""
-    rerun: bool = False
-    """Open the rerun viewer, with taxels as pictures (needs the extra `rerun`)."""
+    """Image file for a figure of angles, forces and timing (.png, .pdf or .svg); None draws no figure."""
     rrd: Path | None = None
-    """Recording for the rerun viewer, to open on another machine; None writes no file."""
+    """Recording for the rerun viewer (extra `rerun`); None writes no file."""
     lerobot: Path | None = None
     """Folder for a dataset of one episode in the LeRobot format (extra `lerobot`), which must not exist yet; None
     writes none."""
@@ -55,53 +55,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     outputs = {"--plot": arguments.plot, "--rrd": arguments.rrd, "--output": arguments.output}
     cli.check_apart(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
-    for path in outputs.values():
-        if path:
-            cli.check_writable(path)
+    for path in filter(None, outputs.values()):
+        cli.check_writable(path)
     if arguments.lerobot:
         check_lerobot(arguments.lerobot)
     prepare_jax()
     cli.enable_caches()
     run = replay(arguments.log, arguments.hand)
     report = run.report
-    for note in report["notes"]:
-        print(note)
-    same = report["readings_same"] == report["observations_same"] == report["ticks"] > 0
+    print(*report["notes"], sep="\n")
     print(
         f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
         f"{report['damaged_bytes']} damaged bytes, end: {report['ended']}"
     )
-    print(_verdict(report, same))
+    print(_verdict(report))
     if arguments.output:
         cli.write_json(arguments.output, report)
-    if arguments.plot and run.ticks:
+    if run.ticks and arguments.plot:
         plot(run, arguments.plot)
-        print(f"figure: {arguments.plot}")
-    if arguments.rerun and run.ticks:
-        open_rerun(run)
-    if arguments.rrd and run.ticks:
-        open_rerun(run, arguments.rrd)
-        print(f"rerun recording: {arguments.rrd}")
-    if arguments.lerobot and run.ticks:
-        print(f"LeRobot dataset: {write_lerobot(arguments.lerobot, run.hand, report['task'], [trajectory(run)])}")
-    return 0 if same else 1
+    if run.ticks and arguments.rrd:
+        write_rerun(run, arguments.rrd)
+    if run.ticks and arguments.lerobot:
+        write_lerobot(arguments.lerobot, run.hand, report["task"], [trajectory(run)])
+    return 0 if report["readings_same"] == report["observations_same"] == report["ticks"] > 0 else 1
 
 
-def _verdict(report: dict[str, Any], same: bool) -> str:
+def _verdict(report: dict[str, Any]) -> str:
     """One line on what was compared."""
     ticks, missing = report["ticks"], report["without_frame"]
+    lacking = f"; {missing} ticks lack their frame (drivers given as sdk: log none)" if missing else ""
     if not ticks:
-        if not missing:
-            return "nothing could be compared: the log has no ticks"
-        why = "" if report["frames"] else "; drivers given as sdk: log none"
-        return f"nothing could be compared: none of {missing} ticks has the frame that it used{why}"
-    line = (
-        "all observations agree to the last bit"
-        if same
-        else f"{report['observations_same']} of {ticks} observations agree; first difference: "
-        f"{report['first_difference']}"
-    )
-    return f"{line}; {missing} more ticks lack their frame and were not compared" if missing else line
+        return f"nothing could be compared{lacking}"
+    if report["first_difference"] is None:
+        return f"all observations agree to the last bit{lacking}"
+    first = report["first_difference"]
+    return f"{report['observations_same']} of {ticks} observations agree; first difference: {first}{lacking}"
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ readings, by the code that ran on the hand. The report counts the ticks that agr
 frame is missing: they are not recomputed.
 """
 
-import dataclasses
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,34 +14,96 @@ import numpy as np
 from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core.config import from_dict
-from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import recorded_hand
-from dexsim.observation import LayoutEntry, Readings, layout
+from dexsim.observation import Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import make_observe
-from dexsim_real.core.log import Kind, LogError, LogReader, reading
+from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
 MEASURED = ("joint_position", "joint_torque", "taxel_force")
-_OTHERS = {
-    "calibrate": ("a calibration", "--from-log"),
-    "identify": ("an identification", "--identify --from-log"),
-}
+_OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
 """Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
-@dataclasses.dataclass
 class Replay:
-    """A recomputed log."""
+    """A log that is recomputed record by record.
 
-    report: dict[str, Any]
-    time: np.ndarray  # [T] s since the first tick
-    measured: list[HandMeasurement]  # one per tick, recomputed
-    ticks: list[dict[str, Any]]  # one per tick, as logged
-    observation: np.ndarray  # [T, n] recomputed
-    fields: tuple[LayoutEntry, ...]  # of the observation
-    hand: Hand
+    Args:
+      path: of the log.
+      meta: configuration of the run.
+      hand: see `replay`.
+    """
+
+    def __init__(self, path: Path, meta: dict[str, Any], hand: str):
+        if options := _OTHERS.get(str(meta.get("task"))):
+            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate {options} {path}` reads it")
+        self.hand = recorded_hand(meta.get("hand"), hand, "the log") or load_hand()
+        calibration = None
+        if meta["calibration"]:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "calibration.toml"
+                file.write_text(meta["calibration"])
+                calibration = load_calibration(file, self.hand)
+        self._sensing = HandSensing(self.hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
+        spec = from_dict(TaskSpec, meta["spec"])
+        self.fields = layout(self.hand, spec.fields, spec.observation)
+        self._observe = make_observe(calibrated_hand(self.hand, calibration), spec.fields, spec.observation)
+        self.report: dict[str, Any] = {"log": str(path)} | {name: meta[name] for name in ("task", "policy")}
+        self.report |= dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
+        self.report |= {"first_difference": None, "ended": "truncated", "recorded_on": meta["environment"]}
+        self.ticks, self.measured = list[dict[str, Any]](), list[HandMeasurement]()  # as logged; recomputed
+        self._times, self._observations = list[float](), list[np.ndarray]()
+        self._states: dict[int, bytes] = {}
+        self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s since the first tick."""
+        return np.array(self._times) - (self._times[0] if self._times else 0.0)
+
+    @property
+    def observation(self) -> np.ndarray:
+        """[T, n] recomputed."""
+        return np.array(self._observations)
+
+    def add(self, record: Record) -> None:
+        """Take in the next record."""
+        content, report = record.content, self.report
+        if record.kind == Kind.META:
+            self._tares.append((content["from"], content["tare"]))
+        elif record.kind == Kind.RECEIVED:
+            number, frame = content
+            report["frames"] += 1
+            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
+                self._states[number] = frame
+                self._states.pop(number - 50, None)
+        elif record.kind == Kind.TICK:
+            frame = self._states.get(content["sequence"])
+            report["without_frame"] += frame is None
+            if frame is not None:
+                self._compare(record.time, content, frame)
+        elif record.kind == Kind.END:
+            report["ended"] = content["end"]
+
+    def _compare(self, time: float, tick: dict[str, Any], frame: bytes) -> None:
+        # The exchange thread may have changed the tare before the tick's record was written.
+        self._sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
+        measured = self._sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
+        # The hand's measurements are recomputed; camera, goal and command are taken from the log.
+        again = {name: getattr(measured, name) for name in MEASURED}
+        same = all(_same(value, tick["readings"][name]) for name, value in again.items())
+        observation = np.asarray(self._observe(Readings(**{**tick["readings"], **again})))
+        identical = _same(observation, tick["observation"])
+        self.report["readings_same"] += same
+        self.report["observations_same"] += identical
+        if not (same and identical) and self.report["first_difference"] is None:
+            self.report["first_difference"] = f"tick {len(self.ticks)} at {time:.3f} s"
+        self._times.append(time)
+        self.measured.append(measured)
+        self.ticks.append(tick)
+        self._observations.append(observation)
 
 
 def replay(path: Path, hand: str = "") -> Replay:
@@ -56,101 +117,21 @@ def replay(path: Path, hand: str = "") -> Replay:
       ConfigError: the log is of another hand.
       LogError: not a log, or one of another command, or the log ends before the hand was ready.
     """
+    reader, run, notes = LogReader(path), None, list[str]()
     with reading(path):
-        return _replay(path, hand)
-
-
-def _replay(path: Path, hand: str) -> Replay:
-    reader = LogReader(path)
-    states: dict[int, bytes] = {}
-    times, measured, observations, notes = [], [], [], []
-    ticks: list[Any] = []
-    fields: tuple[LayoutEntry, ...] = ()
-    tares: list[tuple[int, np.ndarray]] = []  # number of the exchange from which on one holds
-    counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
-    first, meta, end = "", None, None
-    for record in reader:
-        if record.kind == Kind.META and "from" in record.content:
-            tares.append((record.content["from"], record.content["tare"]))
-        elif record.kind == Kind.META:
-            meta = record.content
-            _check_run(path, meta)
-            sensing, observe, fields = _rebuild(meta, hand)
-            tares = [(0, sensing.tare)]
-        elif record.kind == Kind.RECEIVED:
-            number, frame = record.content
-            counts["frames"] += 1
-            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
-                states = {**{n: f for n, f in states.items() if n > number - 50}, number: frame}
-        elif record.kind == Kind.TICK and meta is not None:
-            tick = record.content
-            frame = states.get(tick["sequence"])
-            if frame is None:
-                counts["without_frame"] += 1
-                continue
-            # The exchange thread may have changed the tare before the tick's record was written.
-            sensing.tare = next(tare for begin, tare in reversed(tares) if begin <= tick["sequence"])
-            now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
-            same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)
-            # The hand's measurements are recomputed; camera, goal and command are taken from the log.
-            again = {**tick["readings"], **{name: getattr(now, name) for name in MEASURED}}
-            observation = np.asarray(observe(Readings(**again)))
-            identical = _same(observation, tick["observation"])
-            counts["readings_same"] += same
-            counts["observations_same"] += identical
-            if not (same and identical) and not first:
-                first = f"tick {len(ticks)} at {record.time:.3f} s"
-            times.append(record.time)
-            measured.append(now)
-            ticks.append(tick)
-            observations.append(observation)
-        elif record.kind == Kind.NOTE:
-            notes.append(f"{record.time:.3f} {record.content}")
-        elif record.kind == Kind.END:
-            end = record.content
-    if meta is None:
+        for record in reader:
+            if record.kind == Kind.META and "from" not in record.content:
+                run = Replay(path, record.content, hand)
+            elif record.kind == Kind.NOTE:
+                notes.append(f"{record.time:.3f} {record.content}")
+            elif run is not None:
+                run.add(record)
+    if run is None:
         raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
-    report = {
-        "log": str(path),
-        "task": meta["task"],
-        "policy": meta["policy"],
-        "ticks": len(ticks),
-        **counts,
-        "seconds": times[-1] - times[0] if times else 0.0,
-        "first_difference": first or None,
-        "damaged_bytes": reader.damaged,
-        "ended": end["end"] if end else "truncated",
-        "notes": notes,
-        "recorded_on": meta["environment"],
-    }
-    since = np.array(times) - (times[0] if times else 0.0)
-    return Replay(report, since, measured, ticks, np.array(observations), fields, sensing.hand)
-
-
-def _check_run(path: Path, meta: dict[str, Any]) -> None:
-    """Refuse a configuration that is not of a run."""
-    if other := _OTHERS.get(str(meta.get("task"))):
-        what, options = other
-        raise LogError(f"{path}: this is a log of {what}; `python -m dexsim_real.calibrate {options} {path}` reads it")
-    needed = ("task", "policy", "calibration", "tare", "hardware", "environment")
-    lacking = [name for name in needed if name not in meta]
-    if lacking:
-        raise LogError(f"{path}: this is not a log of a run: its configuration lacks {lacking[0]!r}")
-
-
-def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:
-    """Sensing, observation function and observation fields of a logged run."""
-    hand, calibration = recorded_hand(meta.get("hand"), given, "the log") or load_hand(), None
-    if meta["calibration"]:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "calibration.toml"
-            path.write_text(meta["calibration"])
-            calibration = load_calibration(path, hand)
-    sensing = HandSensing(hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
-    sensing.tare = np.array(meta["tare"], np.float32)
-    spec = from_dict(TaskSpec, meta["spec"])
-    names, config = spec.fields, spec.observation
-    return sensing, make_observe(calibrated_hand(hand, calibration), names, config), layout(hand, names, config)
+    time = run.time
+    run.report |= {"ticks": len(time), "seconds": float(time[-1]) if len(time) else 0.0}
+    run.report |= {"damaged_bytes": reader.damaged, "notes": notes}
+    return run
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:

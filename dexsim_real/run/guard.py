@@ -6,7 +6,7 @@
 signs of life to it, each with the seconds until the next one; the kernel closes it at the runner's death, even by
 SIGKILL. A runner whose sign is overdue, such as one suspended by SIGSTOP, is killed. Only then the guard opens the
 port, so that never two processes talk on the line. It ignores signals and has a session of its own, so Ctrl-C and a
-closed terminal do not end it.
+closed terminal do not end it. It answers each sign: a runner without answers ends its run.
 """
 
 import contextlib
@@ -34,12 +34,13 @@ _STARTUP = 20.0  # s, longest start of the guard
 _PATIENCE = 60.0  # s for which it tries
 _ATTEMPT = 5.0  # s after which it opens the port again
 _BACKOFF = (0.005, 0.1)  # s between attempts to open the port
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGPIPE")
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGPIPE)
 _EVERY = 0.1  # s between two signs of life
 _FREEZE = 1.5  # s without a sign of life that count as frozen, besides the exchanges below
 _EXCHANGES = 10  # exchanges with a silent hand that may pass between two signs, when the port is opened again
-_MOMENT = 0.3  # s for a runner whose sign is overdue: when the whole machine paused, it has to wake too
-_DEATH = 5.0  # s in which a killed process has ended
+_MOMENT = 0.3  # s for a process whose word is overdue: when the whole machine paused, it has to wake too
+_ANSWER = 0.6  # s without an answer after which the guard counts as suspended
+_DEATH = 5.0  # s in which a process that is told to end has ended
 _ENDED = "the runner has ended without turning the motors off"
 _FROZEN = "the runner stood still, and was killed"
 
@@ -68,6 +69,7 @@ class Guard:
         longest = frames.OVERHEAD + frames.STATE_BLOCK.itemsize
         self._allowed = _FREEZE + _EXCHANGES * link.deadline(longest, longest)
         self._armed, self._due = False, 0.0
+        self._asked: float | None = None  # s, of the oldest sign of life without an answer
 
     def arm(self) -> None:
         """Wait until the process is ready; from now on it acts when this one ends, or `beat` is not called.
@@ -75,7 +77,7 @@ class Guard:
         Raises:
           HandError: it did not start.
         """
-        if not select.select([self._output], [], [], _STARTUP)[0] or self._output.readline() != b"ready\n":
+        if not self._answered(_STARTUP):
             raise HandError("the guard process did not start; --no-guard runs without it")
         self._tell(b"%.3f" % self._allowed)
         self._armed = True
@@ -89,57 +91,62 @@ class Guard:
         now = time.monotonic()
         if self._armed and (now >= self._due or more):
             self._due = now + _EVERY
-            with contextlib.suppress(HandError):  # `check` finds a guard that has ended.
-                self._tell(b"%.3f" % (self._allowed + more))
+            self._asked = self._asked or now
+            self._tell(b"%.3f" % (self._allowed + more))
 
     def check(self) -> None:
         """Check that the process runs.
 
         Raises:
-          HandError: it has ended.
+          HandError: it has ended, or is suspended.
         """
         if self._process.poll() is not None:
             raise HandError("the guard process has ended")
+        if self._answered(0.0):
+            self._asked = None
+        late = self._asked is not None and time.monotonic() - self._asked > _ANSWER
+        if late and not self._answered(_MOMENT):
+            raise HandError("the guard process stands still (suspended?)")
 
     def dismiss(self, off: bool) -> None:
         """End of the run. Unless the motors are confirmed to be `off`, the process turns them off."""
         if self._input.closed:
             return
         self._armed = False
-        with contextlib.suppress(HandError):  # It has ended before.
-            if off:
-                self._tell(_OFF)
+        if off:
+            self._tell(_OFF)
         self._input.close()
         self._output.close()
         if off:
             try:
-                self._process.wait(_STARTUP)
+                self._process.wait(_DEATH)
             except subprocess.TimeoutExpired:  # It is suspended, and there is nothing left to do for it.
                 self._process.kill()
 
+    def _answered(self, seconds: float) -> bool:
+        """Wait for a word of the process; whether one has come."""
+        output = self._output.fileno()
+        return bool(select.select([output], [], [], seconds)[0] and os.read(output, 4096))
+
     def _tell(self, word: bytes) -> None:
-        try:
+        with contextlib.suppress(OSError):  # `check` notices a process that has ended, or reads nothing.
             os.write(self._input.fileno(), word + b"\n")
-        except OSError:
-            raise HandError("the guard process has ended") from None
 
 
 def main(argv: Sequence[str]) -> int:
     """The process. Returns its exit code: 1 if the motors were on and the hand did not confirm that they are off."""
-    for name in _SIGNALS:
-        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     runner, port, options = os.getppid(), argv[0], json.loads(argv[1])
-    # What a driver prints must not be taken for the word below, nor fail once the runner is gone.
-    words = os.dup(1)
+    # What a driver prints must not be taken for an answer, nor fail once the runner is gone.
+    answers = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     link = LinkConfig(**options | {"settle": 0.0, "backoff": _BACKOFF})
     # Now, so that nothing must be loaded when it counts.
     module = port.removeprefix("sdk:").partition(":")[0] if port.startswith("sdk:") else "serial"
     with contextlib.suppress(ImportError):  # The runner says so.
         importlib.import_module(module)
-    with contextlib.suppress(OSError):  # The runner may have ended already.
-        os.write(words, b"ready\n")
-    why = _watch(sys.stdin.fileno())
+    why = _watch(sys.stdin.fileno(), answers)
     if not why:
         return 0
     if why == _FROZEN:
@@ -151,10 +158,17 @@ def main(argv: Sequence[str]) -> int:
     return 0 if done else 1
 
 
-def _watch(pipe: int) -> str:
-    """Wait until the motors must be turned off; returns why, or nothing after an orderly end."""
+def _watch(pipe: int, answers: int) -> str:
+    """Wait until the motors must be turned off; returns why, or nothing after an orderly end.
+
+    Args:
+      pipe: from the runner, with its signs of life.
+      answers: to the runner, one for each of them and one for a start.
+    """
     rest, on, until = b"", False, math.inf
     while True:
+        with contextlib.suppress(OSError):  # The runner may have ended already.
+            os.write(answers, b".")
         pause = None if until == math.inf else max(until - time.monotonic(), 0.0)
         ready = select.select([pipe], [], [], pause)[0] or select.select([pipe], [], [], _MOMENT)[0]
         if not ready:

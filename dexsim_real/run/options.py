@@ -51,12 +51,11 @@ class RunArguments:
     tare: bool = True
     """Tare the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand per second, adjusted by up to 1 % so that the policy computes during the wait for an
-    answer."""
+    """Exchanges per second, adjusted by up to 1 % so that the policy computes during the wait for an answer."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
     """Time to move from the measured pose to the task's start posture; 0 stays at the measured pose."""
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
-    """Time in the start posture to put the object into the hand; align it with the palm if the IMU is used."""
+    """Time in the start posture to put the object into the hand, aligned with the palm if the IMU is used."""
     log: Path | None = None
     """Log file; None for a new file in runs/real."""
     output: Path | None = None
@@ -77,7 +76,5 @@ class RunArguments:
     def __post_init__(self):
         validate(self)
         check_mount(self.imu_mount, "--imu-mount")
-        if self.calibration is None and not self.uncalibrated:
-            raise HandError("give --calibration FILE, or --uncalibrated to run on default scales")
-        if self.calibration is not None and self.uncalibrated:
-            raise HandError("give --calibration or --uncalibrated, not both")
+        if (self.calibration is None) != self.uncalibrated:
+            raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")

@@ -20,34 +20,35 @@ class Outcome:
         self._last = began
         self._total = self._blind = self._held = 0.0  # s
         self._actions = self._wrong = 0
-        self._reason = ""  # of the newest hold
+        self._reason = self._silence = ""  # of the newest hold, and of the newest refusal
 
-    def add(self, now: float, measured: bool, safety: Safety) -> None:
+    def add(self, now: float, target: np.ndarray | None, safety: Safety) -> None:
         """Count the time since the last call.
 
         Args:
           now: s.
-          measured: whether the newest measurement was young enough.
+          target: [J] rad that the policy gave; None when no measurement was young enough.
           safety: its newest decision counts, unless the motors are off on purpose.
         """
         step, self._last = now - self._last, now
         self._total += step
-        self._blind += 0.0 if measured else step
+        if target is None:
+            self._blind += step
+            self._silence = safety.refused or self._silence
+        else:
+            self._actions += 1
+            self._wrong += not np.isfinite(target).all()
         reaction, reason = safety.last
         if safety.engaged and reaction >= Reaction.HOLD:
             self._held += step
             self._reason = reason
 
-    def act(self, target: np.ndarray) -> None:
-        """Count an action by the joint targets [J] that it gave."""
-        self._actions += 1
-        self._wrong += not np.isfinite(target).all()
-
     def missing(self, log: LogWriter) -> list[str]:
         """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
         lines = []
         if self._blind > _BLIND * self._total:
-            lines.append(f"no measurement for {self._share(self._blind)} of the run")
+            why = f" ({self._silence})" if self._silence else ""
+            lines.append(f"no measurement for {self._share(self._blind)} of the run{why}")
         if self._wrong:
             lines.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
         if self._held > _HELD * self._total:

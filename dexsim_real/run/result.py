@@ -8,29 +8,21 @@ from dexsim.core import cli
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
-from dexsim_real.run import consent
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.session import Session
+from dexsim_real.run.session import Session, check_terminal
 
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
     """How a run ended, and what it measured."""
 
-    end: str
-    """Why it ended: "time is over", a safety reaction, a signal, or what failed."""
-    code: int
-    """0 for a whole run, 1 if something ended it or is missing, 128 + n after signal n."""
-    problem: str
-    """What ended it early, or what it lacks; empty for a whole run, and after a signal."""
-    motors_off: bool
-    """Whether the hand has confirmed that its motors are off; if not, press the emergency stop."""
-    seconds: float
-    """Duration of the policy, s."""
-    log: Path
-    """Log of all frames and ticks, for `python -m dexsim_real.replay`."""
+    end: str  # why: "time is over", a safety reaction, a signal, or what failed
+    code: int  # 0 for a whole run, 1 if something ended it or is missing, 128 + n after signal n
+    problem: str  # what ended it early, or what it lacks; empty for a whole run, and after a signal
+    log: Path  # of all frames and ticks, for `python -m dexsim_real.replay`
     summary: dict[str, Any]
-    """Statistics: forces in N, successes, jitter, link, cycles by safety reason. `missing` has what is no success."""
+    """Statistics: seconds, forces in N, successes, jitter, link, cycles by safety reason. If `motors_off` is false, the
+    hand has not confirmed that they are: press the emergency stop. `missing` lists what is no success."""
 
 
 def run_policy(
@@ -62,7 +54,7 @@ def run_policy(
 def execute(arguments: RunArguments) -> RunResult:
     """Run with these options, within `stopping`; see `run_policy`."""
     if not (arguments.yes or arguments.motors_off):
-        consent.check_terminal()
+        check_terminal()
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)
@@ -90,12 +82,4 @@ def execute(arguments: RunArguments) -> RunResult:
     summary = session.summary()
     code = code if summary["motors_off"] else 1
     problem = session.end if code == 1 else "; ".join(summary["missing"]) if code == 0 else ""
-    return RunResult(
-        end=session.end,
-        code=1 if problem else code,
-        problem=problem,
-        motors_off=summary["motors_off"],
-        seconds=summary["seconds"],
-        log=session.log.path,
-        summary=summary,
-    )
+    return RunResult(session.end, 1 if problem else code, problem, session.log.path, summary)

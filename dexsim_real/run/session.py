@@ -1,9 +1,11 @@
 """A run on the hand: connect, tare, approach, run the policy, and end with the motors off."""
 
+import contextlib
 import dataclasses
 import gc
 import hashlib
 import sys
+import termios
 import time
 from pathlib import Path
 from typing import Any
@@ -27,12 +29,10 @@ from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.loop import LoopThread
-from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.hand_view import HandState
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.outcome import Outcome
-from dexsim_real.run.status import Status, StatusView
+from dexsim_real.run.status import HandState, StatusView
 from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
@@ -43,6 +43,10 @@ from dexsim_real.wire.link import greet
 from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
+_QUESTION = (
+    "The motors come on at this pose, then the hand moves to its start posture.\n"
+    "Is the power switch within reach, and the hand's room clear? [y/N] "
+)
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 
 
@@ -75,7 +79,7 @@ class Session:
         beat = self.guard.beat if self.guard else lambda more: None
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
         self.loop.retared = self._retare
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self.status, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
         self._policy: PolicyLoop | None = None  # from `prepare` on
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = 0.0
@@ -85,24 +89,23 @@ class Session:
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
-    # --- stages ---------------------------------------------------------------------------------
-
     def prepare(self) -> None:
         """Connect with the motors off, tare the taxels, start camera and IMU.
 
         Raises:
           HandError: something is missing or does not answer.
         """
+        arguments, sensing = self.arguments, self.sensing
         for line in greet(self.port):
             self._note(line)
-        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+        for note in check_identity(getattr(self.port, "identity", None), sensing.hand, sensing.calibration):
             self._note(note)
-        if self.arguments.tare:
-            self._tare()
+        if arguments.tare:
+            for line in self.loop.tare():
+                self._note(f"warning: {line}")
         self._write_meta()
         self.loop.start()
         self._await_pose()
-        arguments = self.arguments
         self._policy = PolicyLoop(
             self.controller,
             self.safety,
@@ -121,7 +124,7 @@ class Session:
         """
         if not (self.arguments.yes or self.arguments.motors_off):
             self.view.show()
-            consent.ask()
+            ask()
             self._await_pose()  # The hand may have been moved or lost meanwhile.
         sys.setswitchinterval(2e-4)
         gc.collect()
@@ -162,22 +165,23 @@ class Session:
         self._closed = True
 
     def summary(self) -> dict[str, Any]:
-        """Results and statistics of the run; JSON-able."""
+        """Results and statistics of the run so far; JSON-able."""
         loop, safety, policy = self.loop, self.safety, self._policy
-        force = policy.finger_force.sum() / max(policy.ticks, 1) if policy else 0.0
+        reaction, reason = safety.last
         summary = {
             "end": self.end,
             "motors_off": not loop.driven,
             "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
             "command": self.arguments.command,
+            "reaction": f"{reaction.name.lower()} {reason}".strip(),
+            "problem": safety.problem,
+            "safety": dict(safety.counts),
+            "mean_finger_force": float(policy.finger_force.sum() / max(policy.ticks, 1)) if policy else 0.0,
             "policy_jitter": self.pace.jitter.summary(),
             "policy_compute": self.compute.summary(),
             "exchange_jitter": loop.pace.jitter.summary(),
             "round_trip": loop.round_trip.summary(),
-            "missed_for_the_hand": loop.waited,
             "link": dataclasses.asdict(self.port.counts),
-            "safety": dict(safety.counts),
-            "mean_finger_force": float(force),
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
             "missing": self.outcome.missing(self.log),
@@ -193,47 +197,21 @@ class Session:
         assert self._policy is not None, "`prepare` comes first"
         return self._policy
 
-    def status(self) -> Status:
-        """The state of the run in words; called from the view's thread."""
-        safety, loop, counts, sample = self.safety, self.loop, self.port.counts, self.safety.sample
+    def hand_state(self) -> HandState | None:
+        """What the view shows of the hand; None without a measurement. Called from the view's thread."""
+        sample, sent = self.safety.sample, self.safety.last[0] != Reaction.RELAX
         if sample is None:
-            return Status({"hand": safety.problem or "no measurement"})
-        reaction, reason = safety.last
-        now, trip = time.monotonic(), loop.round_trip
-        rows = {
-            "time": f"{now - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (now - sample.time):.1f} ms {safety.problem}".strip(),
-            "policy": _timing(self.pace),
-            "exchanges": _timing(loop.pace),
-            "round trip": f"p50 {1e3 * trip.percentile(50):.2f} ms, p99 {1e3 * trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-            f"{counts.late} late, {counts.reconnects} reconnects",
-            "command": f"{self.arguments.command:.2f}",
-        }
-        if self._policy and self._policy.goals:
-            rows["successes"] = str(self._policy.goals.successes)
-        sent = reaction != Reaction.RELAX
-        target = safety.commanded if sent else self.newest.tick.target if self.newest else None
-        return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
-
-    # --- pieces ---------------------------------------------------------------------------------
-
-    def _tare(self) -> None:
-        try:
-            lines = self.loop.tare()
-        except HandError as error:
-            raise HandError(f"{self.arguments.port}: {error}") from None
-        for line in lines:
-            self._note(f"warning: {line}")
+            return None
+        target = self.safety.commanded if sent else self.newest.tick.target if self.newest else None
+        return HandState(self.sensing.hand, sample.measured, target, sent)
 
     def _await_pose(self) -> None:
+        """Check that a hand answers plausibly now."""
         if self.loop.wait_fresh(1.0) is None:
-            self._check_loop()
-            if self.safety.problem:
-                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
-            raise HandError(f"{self.arguments.port}: {why}")
+            self.loop.check()
+            problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
+            silence = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {problem or silence}")
 
     def _await_motors(self) -> None:
         until = time.monotonic() + _STILL
@@ -246,14 +224,9 @@ class Session:
     def _check(self) -> None:
         if self.guard:
             self.guard.check()
-        self._check_loop()
+        self.loop.check()
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
-
-    def _check_loop(self) -> None:
-        if (error := self.loop.error) is not None:
-            why = error if isinstance(error, HandError) else repr(error)
-            raise HandError(f"the exchange thread failed: {why}")
 
     def _run_policy(self) -> str:
         """Tick until the time is over; returns why it ended."""
@@ -266,10 +239,9 @@ class Session:
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
             newest = self.policy.tick(now)
-            self.outcome.add(now, newest is not None, self.safety)
+            self.outcome.add(now, newest.tick.target if newest else None, self.safety)
             if newest is not None:
                 self.newest = newest
-                self.outcome.act(newest.tick.target)
                 self._log_tick(now, newest)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
@@ -278,19 +250,9 @@ class Session:
 
     def _log_tick(self, now: float, newest: PolicyTick) -> None:
         tick, sample = newest
-        readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
-        self.log.add(
-            Kind.TICK,
-            {
-                "sequence": sample.sequence,
-                "age": now - sample.time,
-                "readings": readings,
-                "observation": tick.observation,
-                "action": tick.action,
-                "target": tick.target,
-            },
-            now,
-        )
+        fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
+        fields |= {"sequence": sample.sequence, "age": now - sample.time, "readings": vars(tick.readings)}
+        self.log.add(Kind.TICK, fields, now)
 
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
@@ -314,17 +276,16 @@ class Session:
 
     def _write_meta(self) -> None:
         arguments, policy = self.arguments, self.controller.policy
-        text = arguments.calibration.read_text() if arguments.calibration else ""
-        digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params)))
+        leaves = jax.tree.leaves(policy.params)
         self.log.add(
             Kind.META,
             {
                 "task": policy.task,
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
-                "policy_sha256": digest.hexdigest(),
+                "policy_sha256": hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest(),
                 "hand": record_of(self.sensing.hand),
-                "calibration": text,
+                "calibration": arguments.calibration.read_text() if arguments.calibration else "",
                 "tare": self.sensing.tare,
                 "hardware": to_dict(arguments.hardware),
                 "safety": to_dict(self.safety.config),
@@ -334,6 +295,25 @@ class Session:
                 "environment": cli.environment_report(),
             },
         )
+
+
+def check_terminal() -> None:
+    """Raises HandError: nobody can be asked, since input or error output is no terminal."""
+    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+        raise HandError("no terminal, so nobody can be asked before the motors come on; give --yes or --motors-off")
+
+
+def ask() -> None:
+    """Ask on the terminal whether the motors may come on.
+
+    Raises:
+      HandError: the answer is not yes.
+    """
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # What was typed before the question is no answer to it.
+    print(_QUESTION, end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise HandError("the answer was not yes: the motors stayed off")
 
 
 def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSensors:
@@ -359,13 +339,3 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     except BaseException:
         ObjectSensors(reference, camera, imu).close()
         raise
-
-
-def _timing(pace: Pace) -> str:
-    timing = pace.jitter
-    if not timing.count:
-        return f"{1 / pace.period:.1f} Hz"
-    return (
-        f"{1 / pace.period:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-        f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
-    )

@@ -5,26 +5,31 @@ import dataclasses
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO, cast
 
-from rich.console import Console, Group, RenderableType
+import numpy as np
+from rich import box
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from dexsim.hand.kinematics import Hand
 from dexsim_real.core.process import lower_priority
-from dexsim_real.run.hand_view import HandState, hand_line, hand_tables
+from dexsim_real.sensors.hand import HandMeasurement
 
 _LIVE, _LINES = 0.25, 5.0  # s between two updates of the tables, and between two lines
 
 
 @dataclasses.dataclass(frozen=True)
-class Status:
-    """The state of a run."""
+class HandState:
+    """What the view shows of the hand."""
 
-    rows: dict[str, str]  # name to text
-    hand: HandState | None = None  # None without a measurement
+    hand: Hand
+    measured: HandMeasurement
+    target: np.ndarray | None  # [J] rad, the newest joint targets; None before the first
+    sent: bool  # whether the motors follow them
 
 
 class _Lasting:
@@ -47,22 +52,26 @@ class _Lasting:
 
 
 class StatusView:
-    """Shows `status()` from a background thread. A context manager.
+    """Shows the state of a run from a background thread. A context manager.
 
     Args:
       title: of the tables.
-      status: the current state; called from the background thread, and by `show`.
+      summary: results so far; called from the background thread, and by `show`, like the next.
+      hand: the state of the hand; None without a measurement.
       quiet: show nothing.
     """
 
-    def __init__(self, title: str, status: Callable[[], Status], quiet: bool = False):
+    def __init__(
+        self,
+        title: str,
+        summary: Callable[[], dict[str, Any]],
+        hand: Callable[[], HandState | None],
+        quiet: bool = False,
+    ):
         self.console = _console(quiet)
-        self._title, self._status = title, status
-        self._live = (
-            Live(console=self.console, auto_refresh=False, transient=True)
-            if (self.console.is_terminal and not quiet)
-            else None
-        )
+        self._title, self._summary, self._hand = title, summary, hand
+        live = self.console.is_terminal and not quiet
+        self._live = Live(console=self.console, auto_refresh=False, transient=True) if live else None
         self._notes: deque[str] = deque(maxlen=1000)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
@@ -87,7 +96,7 @@ class StatusView:
 
     def show(self) -> None:
         """Print the tables once."""
-        self.console.print(self._tables(self._status()))
+        self.console.print(self._tables())
 
     def _print_notes(self) -> None:
         with contextlib.suppress(IndexError):  # Another thread may have printed the last one.
@@ -101,29 +110,71 @@ class StatusView:
             self._print_notes()
             elapsed += _LIVE
             if self._live:
-                self._live.update(self._tables(self._status()), refresh=True)
+                self._live.update(self._tables(), refresh=True)
             elif elapsed >= _LINES:
-                elapsed, status = 0.0, self._status()
-                words = status.rows | (hand_line(status.hand) if status.hand else {})
-                self._notes.append(" | ".join(f"{name} {value}" for name, value in words.items()))
+                elapsed = 0.0
+                self._notes.append(" | ".join(f"{name} {text}" for name, text in _texts(self._summary())))
         self._print_notes()
 
-    def _tables(self, status: Status) -> RenderableType:
-        rows = Table.grid(padding=(0, 2))
-        for row in status.rows.items():
-            rows.add_row(*map(escape, row))
-        return Group(escape(self._title), *([hand_tables(status.hand)] if status.hand else []), "", rows)
+    def _tables(self) -> Group:
+        state = self._hand()
+        return Group(*([_hand_tables(state)] if state else []), "", _rows(self._title, self._summary()))
 
 
 def show_summary(title: str, summary: dict[str, Any]) -> None:
     """Print nested results as a table on the standard error."""
+    _console().print(_rows(title, summary))
+
+
+def _rows(title: str, summary: dict[str, Any]) -> Table:
     # Escaped, since an error may have text in brackets, which Rich would take for its markup.
-    table = Table("measure", "value", title=escape(title), title_justify="left")
+    table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
+    for name, text in _texts(summary):
+        table.add_row(name, escape(text))
+    return table
+
+
+def _texts(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and text of each entry that says something."""
     for name, value in summary.items():
         if isinstance(value, dict):
-            value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v not in (0, {}))
-        table.add_row(name.replace("_", " "), escape(_short(value)))
-    _console().print(table)
+            value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v)
+        if value not in ("", []):
+            yield name.replace("_", " "), _short(value)
+
+
+def _hand_tables(state: HandState) -> Table:
+    """Joints on the left, with the error registers of their boards; fingertips on the right."""
+    hand, measured = state.hand, state.measured
+    heat, force = measured.temperature, measured.finger_force
+    joints = _table("joint (rad)", "measured", "target" if state.sent else "(not sent)", "A", "degC")
+    for board in ("errors: palm", "joint", "tip"):
+        joints.add_column(board, justify="right")
+    for joint, name in enumerate(hand.joint_names):
+        joints.add_row(
+            f"{joint:2d} {name}",
+            f"{measured.joint_position[joint]:.3f}",
+            "-" if state.target is None else f"{state.target[joint]:.3f}",
+            f"{measured.current[joint]:.2f}",
+            f"{heat[joint]:.0f}",
+            *(f"{bits:04x}" if bits else "-" for bits in measured.errors[joint]),
+        )
+    fingers = _table("finger", "N", "degC")
+    for finger, name in enumerate(hand.finger_names):
+        fingers.add_row(name, f"{force[finger]:.1f}", f"{heat[hand.num_joints + finger]:.0f}")
+    fingers.add_row("sum", f"{force.sum():.1f}", "")
+    fingers.add_row("palm board", "", f"{heat[-1]:.0f}")
+    both = Table.grid(padding=(0, 3))
+    both.add_row(joints, fingers)
+    return both
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), collapse_padding=True, pad_edge=False, show_edge=False)
+    table.add_column(first, no_wrap=True)
+    for name in others:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
 
 
 def _console(quiet: bool = False) -> Console:

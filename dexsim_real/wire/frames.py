@@ -20,7 +20,6 @@ from dexsim.core.errors import DexsimError
 HEAD = b"\x55\xaa"
 HEADER = struct.Struct("<2sBBBH")
 OVERHEAD = HEADER.size + 2  # bytes of a frame without data
-MAX_DATA = 8192 + 32
 HOST = 0xFE
 BROADCAST = 0xFF
 JOINTS, TIPS, TAXELS = 12, 5, 120
@@ -138,13 +137,7 @@ class Frame:
     data: bytes = b""
 
     def encode(self) -> bytes:
-        """The bytes on the wire.
-
-        Raises:
-          FrameError: more data than a frame can carry.
-        """
-        if len(self.data) > MAX_DATA:
-            raise FrameError(f"{len(self.data)} bytes of data; a frame carries at most {MAX_DATA}")
+        """The bytes on the wire."""
         body = HEADER.pack(HEAD, self.source, self.target, self.command, len(self.data)) + self.data
         return body + crc16(body).to_bytes(2, "little")
 
@@ -166,10 +159,7 @@ class Parser:
 
     A header is valid only with a known command and a length that this command can have; then the checksum decides.
     When it fails, the search continues one byte after that header, so every intact frame of the stream is found.
-    A false header delays the next frame by at most one frame.
-
-    Memory is bounded by one frame and one chunk. Each byte is searched once for the head, and enters the checksum at
-    most once for each valid header in the longest frame before it.
+    Memory is bounded by one frame and one chunk.
 
     Args:
       lengths: possible data lengths of each command, `HAND_REPLIES` or `HOST_REQUESTS`.
@@ -263,15 +253,9 @@ def command_block(
     """
     block = np.zeros((), COMMAND_BLOCK)
     block["id"] = np.arange(JOINTS)
-    for name, value in (
-        ("position", position),
-        ("kp", kp),
-        ("ki", ki),
-        ("kd", kd),
-        ("torque_max", torque_max),
-        ("mode", mode),
-    ):
-        block[name] = value
+    block["position"] = position
+    block["kp"], block["ki"], block["kd"] = kp, ki, kd
+    block["torque_max"], block["mode"] = torque_max, mode
     return block
 
 
@@ -289,7 +273,9 @@ def decode_command(data: bytes) -> np.ndarray:
     Raises:
       FrameError: wrong size, or the ids are not 0 to 11.
     """
-    return _decode(data, COMMAND_BLOCK, "command", lambda block: block["id"])
+    block = _decode(data, COMMAND_BLOCK)
+    _check_ids(block["id"])
+    return block
 
 
 def decode_state(data: bytes) -> np.ndarray:
@@ -298,13 +284,17 @@ def decode_state(data: bytes) -> np.ndarray:
     Raises:
       FrameError: wrong size, or the joint ids are not 0 to 11.
     """
-    return _decode(data, STATE_BLOCK, "state", lambda block: block["joint"]["id"])
-
-
-def _decode(data: bytes, dtype: np.dtype, what: str, ids) -> np.ndarray:
-    if len(data) != dtype.itemsize:
-        raise FrameError(f"{what} block of {len(data)} bytes, expected {dtype.itemsize}")
-    block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
-    if not np.array_equal(ids(block), np.arange(JOINTS)):
-        raise FrameError(f"{what} block with joint ids {ids(block).tolist()}")
+    block = _decode(data, STATE_BLOCK)
+    _check_ids(block["joint"]["id"])
     return block
+
+
+def _decode(data: bytes, dtype: np.dtype) -> np.ndarray:
+    if len(data) != dtype.itemsize:
+        raise FrameError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
+    return np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
+
+
+def _check_ids(ids: np.ndarray) -> None:
+    if not np.array_equal(ids, np.arange(JOINTS)):
+        raise FrameError(f"block with joint ids {ids.tolist()}")

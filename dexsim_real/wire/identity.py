@@ -14,8 +14,6 @@ from dexsim_real.core.errors import HandError
 SIDE, SERIAL_NUMBER = 20, 21
 """Registers."""
 _WORDS = {"l": "left", "left": "left", "r": "right", "right": "right", "2l32": "left", "2r32": "right"}
-_SIDES = ("left", "right")
-_CODE = "code "
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +36,7 @@ def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
     for word in (_text(side or b""), text[:4]):
         if word.lower() in _WORDS:
             return Identity(text, _WORDS[word.lower()])
-    return Identity(text, f"{_CODE}{side[0]}" if side else "")
+    return Identity(text, f"code {side[0]}" if side else "")
 
 
 def check_identity(identity: Identity | None, hand: Hand, calibration: Calibration | None = None) -> list[str]:
@@ -52,42 +50,29 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     Raises:
       HandError: it is another hand.
     """
-    if identity is not None and not isinstance(identity, Identity):
-        raise HandError(f"the driver's `identity` is {identity!r:.80}; expected an `Identity`, or None")
-    reported = identity or Identity()
-    for name, value in dataclasses.asdict(reported).items():
-        if not isinstance(value, str):
-            raise HandError(f"the driver's `identity` has {name} {value!r:.80}; expected text")
-    if reported.handedness not in ("", *_SIDES) and not reported.handedness.startswith(_CODE):
+    serial, side = (identity.serial_number, identity.handedness.lower()) if identity else ("", "")
+    model = next((name for name in ("left", "right") if name in hand.name), "")
+    if model and side in ("left", "right") and side != model:
+        raise HandError(f"this is a {side} hand (serial number {serial}), the model a {model} one")
+    expected = calibration.serial if calibration else ""
+    if expected and not serial:
         raise HandError(
-            f"the driver's `identity` has handedness {reported.handedness!r:.80}; expected 'left', 'right' or '', or "
-            f"'{_CODE}' and what the hand told"
+            f"the hand does not tell its serial number, and the calibration is of hand {expected}: calibrate this "
+            "hand, or remove the serial number from the file if it is this hand's"
         )
-    model = next((side for side in _SIDES if side in hand.name), "")
-    if model and reported.handedness in _SIDES and reported.handedness != model:
+    if expected and serial != expected:
+        raise HandError(f"this is hand {serial}, the calibration is of hand {expected}: calibrate this hand")
+    if calibration and calibration.handedness and side and side != calibration.handedness:
         raise HandError(
-            f"this is a {reported.handedness} hand (serial number {reported.serial_number}), the model a {model} one"
+            f"this hand is {side}, the calibration is of a {calibration.handedness} one: calibrate this hand"
         )
-    serial = calibration.serial if calibration else ""
-    if serial and not reported.serial_number:
-        raise HandError(
-            f"the hand does not tell its serial number, and the calibration is of hand {serial}: calibrate this hand, "
-            "or remove the serial number from the file if it is this hand's"
-        )
-    if serial and serial != reported.serial_number:
-        raise HandError(
-            f"this is hand {reported.serial_number}, the calibration is of hand {serial}: calibrate this hand"
-        )
-    side = calibration.handedness if calibration else ""
-    if side and reported.handedness and side != reported.handedness:
-        raise HandError(f"this hand is {reported.handedness}, the calibration is of a {side} one: calibrate this hand")
     notes = []
-    if not reported.serial_number:
+    if not serial:
         notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
-    elif calibration and not serial:
+    elif calibration and not expected:
         notes.append("the calibration names no serial number: it may be of another hand")
-    if reported.handedness.startswith(_CODE):
-        notes.append(f"the hand gives its side as {reported.handedness}, whose meaning is not known")
+    if side.startswith("code"):
+        notes.append(f"the hand gives its side as {side}, whose meaning is not known")
     return [f"warning: {note}" for note in notes]
 
 

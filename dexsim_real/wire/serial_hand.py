@@ -17,7 +17,7 @@ from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
-from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply, check_port
+from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
 from dexsim_real.wire.refusals import Refusal, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
@@ -54,7 +54,8 @@ class SerialHand:
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
-        self._others = 0  # frames of other hands
+        self._others = self._early = 0  # frames of other hands; answers that came sooner than the baud rate allows
+        self._owed = False  # whether the last request has not been answered yet
         self._generation = 0
         self._first: Reply | None = None
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
@@ -65,7 +66,7 @@ class SerialHand:
         try:
             time.sleep(self.config.settle)
             version = self._greet(self.config.handshake)
-            self.identity = self._identify()
+            self.identity = self._read_identity()
         except HandError:
             self.close()
             raise
@@ -77,7 +78,6 @@ class SerialHand:
         return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
-        """Send a command and wait for the answer, None without one; see `HandPort.exchange`."""
         self.refusal = None
         if self._serial is None:
             return self._reconnect()
@@ -103,8 +103,7 @@ class SerialHand:
     # --- one exchange ---------------------------------------------------------------------
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
-        data = command.tobytes()
-        frame, sent = self._request(Command.EXCHANGE, data, frames.STATE_BLOCK.itemsize)
+        frame, sent = self._request(Command.EXCHANGE, command.tobytes(), frames.STATE_BLOCK.itemsize)
         if frame is None:
             return None
         try:
@@ -158,9 +157,11 @@ class SerialHand:
                 if possible and frame.command in (command, Command.ERROR):
                     self.counts.late += answer is not None  # The newer of two answers counts.
                     answer = frame
-                else:
-                    self.counts.late += 1  # It answers an earlier request.
+                else:  # It answers an earlier request.
+                    self.counts.late += 1
+                    self._early += not (possible or self._owed)
                     self._received -= size
+        self._owed = answer is None and not self._early
         return answer
 
     def _read(self) -> bytes:
@@ -227,7 +228,7 @@ class SerialHand:
             if time.monotonic() > until:
                 raise HandError(self._silence())
 
-    def _identify(self) -> Identity:
+    def _read_identity(self) -> Identity:
         return read_identity(self._register(SERIAL_NUMBER), self._register(SIDE))
 
     def _register(self, number: int) -> bytes | None:
@@ -249,43 +250,39 @@ class SerialHand:
         """
         if self.identity == Identity():
             return
-        identity = self._identify()
-        if identity == self.identity:
-            return
-        text = f"another hand is on {self.port}: {identity.describe()}, not {self.identity.describe()}"
-        complete = all(
-            new or not old for new, old in zip(vars(identity).values(), vars(self.identity).values(), strict=True)
-        )
-        self.refusal = Refusal(text, serious=True) if complete else None
-        raise HandError(text)
+        identity = self._read_identity()
+        if identity != self.identity:
+            text = f"another hand is on {self.port}: {identity.describe()}, not {self.identity.describe()}"
+            self.refusal = Refusal(text, serious=True)
+            raise HandError(text)
 
     def _silence(self) -> str:
-        if not self._received:
-            return (
-                f"{self.port}: no answer; check the power, the A and B wires of RS485, and that the hand has the id "
-                f"{self.config.hand_id} (--link.hand-id)"
+        """Why there is no valid answer, and what to do."""
+        config, counts = self.config, self.counts
+        if not self._received and not counts.late:
+            why = (
+                "no answer; check the power, the A and B wires of RS485, and that the hand has the id "
+                f"{config.hand_id} (--link.hand-id)"
             )
-        if self._others and not self.counts.late:
-            return (
-                f"{self.port}: frames come, but from no hand with the id {self.config.hand_id}; check --link.hand-id, "
-                "and that nothing else talks on the line"
+        elif self._early:
+            why = f"answers arrive sooner than {config.baud} baud allow; use --link.no-paced for an emulated line"
+        elif counts.late:
+            why = f"answers come too late; raise --link.margin (now {config.margin:g} s), or check the latency timer"
+        elif self._others:
+            why = (
+                f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id, and that nothing "
+                "else talks on the line"
             )
-        if self.counts.late:
-            return (
-                f"{self.port}: answers arrive sooner than {self.config.baud} baud allow; use --link.no-paced for an "
-                "emulated line without timing"
+        elif self.refusal is not None:
+            why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
+        elif not self._parser.counts.frames and not self._parser.counts.crc_errors:
+            why = f"no bytes belong to a frame; set --link.baud to that of the hand (now {config.baud} baud)"
+        else:
+            why = (
+                f"the hand answers without a valid state ({counts.crc_errors} wrong checksums, {counts.refused} "
+                "refusals); check cable and termination"
             )
-        if self.refusal is not None:
-            return f"{self.port}: {self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
-        if not self._parser.counts.frames and not self._parser.counts.crc_errors:
-            return (
-                f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to that of the hand "
-                f"(now {self.config.baud} baud)"
-            )
-        return (
-            f"{self.port}: the hand answers without a valid state ({self.counts.crc_errors} "
-            f"wrong checksums, {self.counts.refused} refusals); check cable and termination"
-        )
+        return f"{self.port}: {why}"
 
     def _reconnect(self) -> Reply | None:
         if time.monotonic() < self._retry_at:
@@ -313,14 +310,12 @@ def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] |
       tap: see `SerialHand`.
 
     Raises:
-      HandError: the module or function cannot be found, or it returned no `HandPort`.
+      HandError: the module or function cannot be found.
     """
     if not spec.startswith("sdk:"):
         return SerialHand(spec, config, tap=tap)
     form = "sdk:MODULE:FUNCTION of an importable module"
-    port = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
-    check_port(port, spec)
-    return port
+    return find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
 
 
 def _printable(data: bytes) -> str:

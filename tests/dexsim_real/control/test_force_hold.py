@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_safety import CYCLE, MIDDLE, Bench, sample
+from test_safety import CYCLE, MIDDLE, ready, sample
 from test_starts import Hands
 
 from dexsim_real.control.limits import SafetyConfig
@@ -11,13 +11,13 @@ from dexsim_real.control.safety import Safety
 JOINT = np.arange(12) == 4
 
 
-def hold(hand, error, force, *, seconds=12.0, wish=MIDDLE, before=2.0):
+def hold(hand, error, force, *, seconds=12.0, target=MIDDLE, before=2.0):
     """True angle [T] rad of the joint less its first, and whether [T] its motor is on, from the first force on.
 
     Args:
       error: rad by which the joint reads too high, by the number of the cycle.
       force: N of each fingertip, by the number of the cycle.
-      wish: [J] rad, target throughout.
+      target: [J] rad, throughout.
     """
     hands, safety = Hands(hand, 1), Safety(hand, SafetyConfig())
     safety.engage()
@@ -25,7 +25,7 @@ def hold(hand, error, force, *, seconds=12.0, wish=MIDDLE, before=2.0):
     for k in range(-round(before / CYCLE), round(seconds / CYCLE)):
         reading = hands.angle[0] + (error(k) if k >= 0 else 0.0) * JOINT
         safety.see(sample(hands.time, reading, force=force(k) if k >= 0 else 0.0))
-        safety.set_target(wish, hands.time)
+        safety.set_target(target, hands.time)
         decision = safety.decide(hands.time)
         hands.cycle(decision.position[None], np.array([decision.mode != 0]), np.array([decision.stiffness]))
         if k >= 0:
@@ -66,13 +66,11 @@ def test_whatever_a_joint_reads_an_easing_hand_does_not_go_far(hand):
 
 def test_a_finger_that_is_pushed_gives_way(hand):
     """By a tenth of a radian from where it was, at the speed of starts."""
-    bench = Bench(hand)
-    bench.engage()
-    bench.run(2.0, wish=MIDDLE)
+    bench = ready(hand)
     commands = []
     for _ in range(round(1.0 / CYCLE)):
         bench.position = bench.position - np.float32(0.004) * JOINT
-        commands.append(bench.cycle(wish=MIDDLE, follow=False, force=30.0).position[4] - MIDDLE[4])
+        commands.append(bench.cycle(target=MIDDLE, follow=False, force=30.0).position[4] - MIDDLE[4])
     assert np.abs(np.diff(commands)).max() <= 0.5 * CYCLE + 1e-6
     assert commands[-1] == pytest.approx(-0.1, abs=0.005)
 
@@ -83,14 +81,14 @@ def test_short_holds_far_apart_end_nothing(hand):
     assert on.all() and not safety.latched
 
 
-@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"wish": np.full(12, np.nan)}])
+@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"target": np.full(12, np.nan)}])
 def test_no_hold_lasts_for_ever(hand, event):
     safety, now = Safety(hand, SafetyConfig()), 0.0
     safety.engage()
     modes = []
     for _ in range(round(8.0 / CYCLE)):
         safety.see(sample(now, MIDDLE, velocity=event.get("velocity", 0.0)))
-        safety.set_target(event.get("wish", MIDDLE), now)
+        safety.set_target(event.get("target", MIDDLE), now)
         modes.append(safety.decide(now).mode != 0)
         now += CYCLE
     assert 5.0 <= sum(modes) * CYCLE < 5.1 and not modes[-1] and safety.latched.endswith("for 5 s")

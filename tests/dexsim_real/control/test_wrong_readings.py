@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
+from test_safety import AGREEING, CYCLE, FREE, MIDDLE, UNSEEN, Bench, ready, sample
 
-from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.pose_check import PoseCheck
-from dexsim_real.control.safety import Reaction, Safety, TargetRequest
+from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
+from dexsim_real.control.safety import Reaction
 from dexsim_real.core.errors import HandError
-from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Reply
+
+JOINT, START = 4, 0.9  # index_joint1, in the middle of its range
+WAYS = pytest.mark.parametrize("way", [1.0, -1.0])
 
 
 def wrong(joint, value, base=MIDDLE):
@@ -28,77 +27,42 @@ def wrong(joint, value, base=MIDDLE):
 
 @pytest.fixture
 def bench(hand):
-    bench = Bench(hand)
-    bench.engage()
-    bench.run(2.0, wish=MIDDLE)
-    return bench
+    return ready(hand)
 
 
-@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"wish": np.full(12, np.nan)}])
-def test_hold_keeps_the_last_confirmed_command(bench, event):
-    """The hand is pressed away from its command; hold keeps the command."""
-    wish = MIDDLE + np.float32(0.15) * FREE
-    bench.run(1.0, wish=wish)
-    bench.position = wish - np.float32(0.15) * FREE
-    bench.cycle(wish=wish, follow=False)
-    for _ in range(20):
-        decision = bench.cycle(**{"wish": wish, "follow": False} | event)
-        assert decision.reaction == Reaction.HOLD
-        np.testing.assert_array_equal(decision.position, wish)
-
-
-def test_a_command_that_was_not_answered_is_not_held(bench):
-    confirmed = bench.cycle(wish=MIDDLE + np.float32(0.02), follow=False).position
-    bench.cycle(wish=MIDDLE + np.float32(0.04), follow=False)  # Its measurement confirms the one before.
-    sent = bench.cycle(wish=MIDDLE + np.float32(0.06), fresh=False, follow=False).position
-    held = bench.cycle(wish=np.full(12, np.nan), fresh=False).position
-    assert not np.array_equal(held, sent)
-    np.testing.assert_array_equal(held, confirmed)
-
-
-def test_too_much_force_eases_slowly_toward_the_measured_pose(bench):
-    """Keeping the command would keep the force."""
-    wish = MIDDLE + np.float32(0.1) * FREE
-    bench.run(1.0, wish=wish, follow=False)
-    path = [d.position for d in bench.run(0.5, wish=wish, follow=False, force=30.0)]
-    assert np.abs(np.diff(path, axis=0)).max() <= 0.5 * CYCLE + 1e-6
-    np.testing.assert_allclose(path[-1], MIDDLE, atol=1e-6)
-
-
-@pytest.mark.parametrize("value", [1.3, -1.3, 1e30, 1.9])
-@pytest.mark.parametrize("cycles", [1, 3, 40])
-@pytest.mark.parametrize("reason", ["", "the object is out of sight"])
-def test_a_wrong_angle_moves_nothing(bench, value, cycles, reason):
-    """For one cycle, for a few, and for half a second; while the policy is in command, and in a hold."""
+@pytest.mark.parametrize("value", [1.3, -1.3, 1e30, 1.9, np.nan])
+@pytest.mark.parametrize("cycles", [1, 40])
+@pytest.mark.parametrize("hold", ["", UNSEEN])
+def test_a_wrong_angle_moves_nothing(bench, value, cycles, hold):
+    """For one cycle and for half a second; while the policy is in command, and in a hold."""
     true = bench.position.copy()
     bench.position = wrong(4, value if value in (1e30, 1.9) else true[4] + value)
     for _ in range(cycles):
-        bench.safety.set_target(MIDDLE, bench.now, reason)
-        decision = bench.cycle(follow=False)
+        decision = bench.cycle(target=MIDDLE, hold=hold, follow=False)
         assert decision.mode == Mode.POSITION
         np.testing.assert_array_equal(decision.position, MIDDLE)
-    np.testing.assert_array_equal(bench.safety.sample.measured.joint_position, true)
+    np.testing.assert_allclose(bench.safety.sample.measured.joint_position, true, atol=2e-7)
     bench.position = true
-    decision = bench.cycle(wish=MIDDLE)
-    assert decision.reaction == Reaction.NONE
+    assert bench.cycle(target=MIDDLE).reaction == Reaction.NONE
     assert bench.safety.counts["implausible: measurement"] == cycles
 
 
 def test_wrong_angles_that_last_turn_the_motors_off_and_name_the_joint(bench):
     bench.position = wrong(4, 1.9)
-    decisions = bench.run(1.2, wish=MIDDLE, follow=False)
+    decisions = bench.run(1.2, target=MIDDLE, follow=False)
     assert decisions[-1].mode == Mode.PASSIVE
     assert all(np.array_equal(d.position, MIDDLE) for d in decisions if d.mode == Mode.POSITION)
     assert "implausible" in bench.safety.latched and "index_joint1 reads 1.9 rad" in bench.safety.latched
 
 
-def test_reach_does_not_pull_a_command(hand, bench):
-    """A joint that is off slowly enough to be believed takes no command along."""
-    for k in range(60):
-        bench.position = wrong(4, MIDDLE[4] + 0.016 * k)
-        decision = bench.cycle(wish=MIDDLE, follow=False)
-        assert decision.mode == Mode.POSITION
-        np.testing.assert_array_equal(decision.position, MIDDLE)
+def test_wrong_readings_far_apart_do_not_add_up(bench):
+    """One every two seconds for half a minute; each is a fault, but none of them lasts."""
+    for _ in range(15):
+        bench.position = wrong(4, 1.9)
+        bench.cycle(target=MIDDLE, follow=False)
+        bench.position = MIDDLE
+        assert all(d.mode == Mode.POSITION for d in bench.run(2.0, target=MIDDLE))
+    assert bench.safety.counts["implausible: measurement"] == 15 and not bench.safety.latched
 
 
 @pytest.mark.parametrize("pose", [wrong(4, 2.2), wrong(3, -0.4), np.full(12, -0.5, np.float32)])
@@ -107,29 +71,144 @@ def test_nothing_is_enabled_on_a_pose_outside_the_limits(hand, pose):
     bench.position = pose
     bench.run(0.1)
     bench.safety.engage()
-    assert all(d.mode == Mode.PASSIVE for d in bench.run(3.0, wish=MIDDLE, follow=False))
+    assert all(d.mode == Mode.PASSIVE for d in bench.run(3.0, target=MIDDLE, follow=False))
     assert "outside its limits" in bench.safety.problem
 
 
-def test_nothing_is_enabled_on_a_single_reading(hand):
-    bench = Bench(hand)
-    bench.engage()
-    bench.run(0.1, fresh=False)
-    for k in range(20):  # Every other reading is off: none of them is the pose.
-        bench.position = wrong(4, 1.9 if k % 2 else 0.9)
-        assert bench.cycle(wish=MIDDLE, generation=2, follow=False).mode == Mode.PASSIVE
+def test_a_wrong_angle_before_a_silence_remains_wrong_after_it(bench):
+    """Readings agree, but on an angle that was wrong: the motors do not come on there."""
+    bench.position = wrong(4, 1.9)
+    bench.run(0.5, target=MIDDLE, follow=False)
+    assert bench.run(2.0, target=MIDDLE, fresh=False, follow=False)[-1].mode == Mode.PASSIVE
+    back = bench.run(0.5, target=MIDDLE, follow=False)
+    assert all(decision.mode == Mode.PASSIVE for decision in back) and "index_joint1" in back[-1].reason
+    assert bench.safety.latched.startswith("implausible measurements for 1 s: joint index_joint1")
 
 
-def test_a_moving_joint_is_plausible_up_to_its_speed(hand):
-    check, top = PoseCheck(hand, 0.1), np.asarray(hand.speed_limit)
-    position, goal = np.full(12, 0.1), np.asarray(hand.joint_upper)
-    for k in range(AGREEING):
-        check.judge(k * CYCLE, position, None)
-    assert check.at_rest is not None
+@pytest.mark.parametrize("generation", [1, 2])
+def test_after_a_reading_that_was_no_number_several_must_agree_as_well(bench, generation):
+    """It was the last before the hand was silent for long, or disconnected."""
+    bench.position = np.full(12, np.nan, np.float32)
+    bench.cycle(target=MIDDLE, follow=False)
+    if generation == 1:
+        assert bench.run(2.0, target=MIDDLE, fresh=False, follow=False)[-1].mode == Mode.PASSIVE
+    bench.position = MIDDLE - np.float32(0.1) * FREE
+    back = [bench.cycle(target=MIDDLE, generation=generation) for _ in range(AGREEING)]
+    assert [decision.mode for decision in back] == [Mode.PASSIVE] * (AGREEING - 1) + [Mode.POSITION]
+    assert {decision.reason for decision in back[:-1]} == {UNKNOWN}
+
+
+# --- the check of a pose ---------------------------------------------------------------------------
+
+
+def pose(angle=START):
+    return np.array([0.9, 0.4, 0.8, 0.0] + [angle] + [START] * 7)
+
+
+@pytest.fixture
+def check(hand):
+    """Knows the pose, motors on where the hand is. The newest reading is of time 0."""
+    check = PoseCheck(hand, 0.1)
+    for k in range(1 - AGREEING, 1):
+        check.judge(k * CYCLE, pose(), None)
+    np.testing.assert_array_equal(check.at_rest, pose())
+    check.follow(pose())
+    return check
+
+
+def fastest(hand):
+    """rad/s"""
+    return 1.25 * float(hand.speed_limit[JOINT])
+
+
+@WAYS
+@pytest.mark.parametrize("gap", [CYCLE, 0.03, 0.5])
+def test_away_from_its_commands_a_joint_moves_for_30_ms_at_most(hand, check, way, gap):
+    """However long nothing was read: with the motors on nothing carries it farther."""
+    room = 0.1 + fastest(hand) * min(gap, 0.03)
+    assert "index_joint1 reads" in check.judge(gap, pose(START + way * (room + 0.02)), pose())
+    assert check.judge(gap + 1e-9, pose(START + way * 0.09), pose()) == ""
+
+
+@WAYS
+def test_toward_its_command_a_joint_moves_no_faster_than_it_can(hand, check, way):
+    command = pose(START + way * 0.8)
+    check.follow(command)
+    room = 0.1 + fastest(hand) * CYCLE
+    assert "too far from 0.90 rad before" in check.judge(CYCLE, pose(START + way * (room + 0.02)), command)
+    # The same angle is plausible once there was time to get there.
+    assert check.judge(2 * CYCLE, pose(START + way * (room + 0.02)), command) == ""
+
+
+def test_a_moving_joint_is_plausible_up_to_its_speed(hand, check):
+    position, goal = pose(), np.asarray(hand.joint_upper)
     check.follow(goal)
-    for k in range(AGREEING, 40):
-        position = np.minimum(position + top * CYCLE, goal)
+    for k in range(1, 40):
+        position = np.minimum(position + hand.speed_limit * CYCLE, goal)
         assert check.judge(k * CYCLE, position, goal) == ""
+
+
+@WAYS
+def test_beyond_its_command_it_is_wrong_however_long_it_lasts(hand, check, way):
+    angle = START + way * (0.1 + fastest(hand) * CYCLE + 0.02)
+    for k in range(1, 200):
+        assert check.judge(k * CYCLE, pose(angle), pose())
+    assert check.judge(200 * CYCLE, pose(), pose()) == ""
+
+
+@WAYS
+def test_commands_explain_a_motion_since_the_last_reading_and_not_later(check, way):
+    """A joint may have followed the command before the newest; one that came back does not go there again by itself."""
+    check.follow(pose(START + way * 0.5))
+    check.follow(pose())
+    assert check.judge(0.1, pose(START + way * 0.5), pose()) == ""
+    for k, angle in enumerate(START + way * np.linspace(0.5, 0.0, 20)):
+        assert check.judge(0.2 + k * CYCLE, pose(angle), pose(angle)) == ""
+    for k in range(200):
+        assert check.judge(0.5 + k * CYCLE, pose(START + way * 0.5), pose())
+
+
+@pytest.mark.parametrize("apart", [0.049, 0.051, -0.049, -0.051])
+@pytest.mark.parametrize("at", [0, 5, 9])
+def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
+    """With the motors off; wherever among the last ten the wrong one is, the pose is the median."""
+    check = PoseCheck(hand, 0.1)
+    for k in range(AGREEING):
+        assert check.at_rest is None
+        assert check.judge(k * CYCLE, pose(START + apart * (k == at)), None) == ""
+    if abs(apart) > 0.05:
+        assert check.at_rest is None
+    else:
+        np.testing.assert_array_equal(check.at_rest, pose())
+
+
+def test_four_equal_wrong_readings_of_ten_do_not_move_the_pose(hand):
+    check = PoseCheck(hand, 0.1)
+    for k in range(AGREEING):
+        check.judge(k * CYCLE, pose(START + 0.04 * (k in (1, 2, 8, 9))), None)
+    np.testing.assert_array_equal(check.at_rest, pose())
+
+
+@pytest.mark.parametrize("angle", [2.02, -0.11])
+def test_a_reading_outside_the_limits_ends_the_agreement(hand, angle):
+    check = PoseCheck(hand, 0.1)
+    for k in range(AGREEING - 1):
+        check.judge(k * CYCLE, pose(), None)
+    assert "outside its limits" in check.judge(AGREEING * CYCLE, pose(angle), None)
+    for k in range(AGREEING):
+        assert check.at_rest is None
+        assert check.judge((AGREEING + k) * CYCLE, pose(), None) == ""
+    assert check.at_rest is not None
+
+
+def test_motors_that_went_off_unseen_come_on_at_a_pose_of_new_readings(check):
+    for k in range(1, AGREEING + 1):
+        assert check.at_rest is None or k == 1
+        assert check.judge(k * CYCLE, pose(), None) == ""
+    assert check.at_rest is not None
+
+
+# --- any readings and targets ------------------------------------------------------------------------
 
 
 READING = st.one_of(
@@ -137,9 +216,9 @@ READING = st.one_of(
     st.just("true"),
     st.tuples(st.integers(0, 11), st.one_of(st.floats(width=32), st.floats(-1.75, 1.75, width=32))),
 )
-WISH = st.one_of(st.none(), st.floats(width=32), st.lists(st.floats(-3, 3, width=32), min_size=12, max_size=12))
+TARGET = st.one_of(st.none(), st.floats(width=32), st.lists(st.floats(-3, 3, width=32), min_size=12, max_size=12))
 STEPS = st.lists(
-    st.tuples(READING, WISH, st.sampled_from([0.0, 30.0]), st.sampled_from([1] * 9 + [2]), st.floats(0.001, 0.2)),
+    st.tuples(READING, TARGET, st.sampled_from([0.0, 30.0]), st.sampled_from([1] * 9 + [2]), st.floats(0.001, 0.2)),
     max_size=60,
 )
 
@@ -152,15 +231,15 @@ def test_no_readings_and_targets_make_a_command_jump(hand, steps):
     bench.engage()
     bench.cycle()
     last, before = bench.position, bench.now - CYCLE
-    for reading, wish, force, generation, pause in steps:
+    for reading, target, force, generation, pause in steps:
         now, position = bench.now, bench.position
         if reading is not None:
             if reading != "true":
                 position = wrong(*reading, position)
             with np.errstate(all="ignore"):
                 bench.safety.see(sample(now, position, force=force, generation=generation))
-        if wish is not None:
-            bench.safety.set_target(np.full(12, wish) if isinstance(wish, float) else np.array(wish), now)
+        if target is not None:
+            bench.safety.set_target(np.full(12, target) if isinstance(target, float) else np.array(target), now)
         decision = bench.safety.decide(now)
         assert np.isfinite(decision.position).all()
         assert np.all(decision.position >= hand.joint_lower) and np.all(decision.position <= hand.joint_upper)
@@ -174,42 +253,16 @@ def test_no_readings_and_targets_make_a_command_jump(hand, steps):
         bench.now += pause
 
 
-class Alternating:
-    """A wish that another thread replaces in the middle of `decide`: each read gives the other one."""
-
-    def __init__(self, wishes):
-        self._wishes, self.reads = wishes, 0
-
-    def __get__(self, safety, kind):
-        self.reads += 1
-        return self._wishes[(self.reads - 1) % len(self._wishes)]
-
-    def __set__(self, safety, value):
-        pass
-
-
-def test_the_wish_is_read_once_a_cycle(bench):
-    good, bad = (TargetRequest(bench.now, pose, "", bench.now) for pose in (MIDDLE, np.full(12, np.nan, np.float32)))
-
-    class Torn(Safety):
-        _target = Alternating([good, bad])
-
-    bench.safety.__class__ = Torn
-    for _ in range(6):
-        bench.safety.see(sample(bench.now, MIDDLE))
-        assert np.isfinite(bench.safety.decide(bench.now).position).all()
-
-
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.one_of(st.just(np.nan), st.just(np.inf), st.floats(-2, 2, width=32)), min_size=2, max_size=6))
-def test_a_second_thread_that_writes_any_wish_puts_nothing_wrong_on_the_wire(hand, wishes):
+def test_a_second_thread_that_writes_any_target_puts_nothing_wrong_on_the_wire(hand, targets):
     bench, sensing, stop = Bench(hand), HandSensing(hand, HardwareConfig()), threading.Event()
     bench.engage()
 
     def write():
         while not stop.is_set():
-            for wish in wishes:
-                bench.safety.set_target(np.full(12, wish), bench.now)
+            for target in targets:
+                bench.safety.set_target(np.full(12, target), bench.now)
 
     before, thread = sys.getswitchinterval(), threading.Thread(target=write)
     sys.setswitchinterval(1e-6)
@@ -227,36 +280,8 @@ def test_a_second_thread_that_writes_any_wish_puts_nothing_wrong_on_the_wire(han
     assert np.abs(np.diff(sent, axis=0)).max() <= 8.0 * CYCLE + 1e-5
 
 
-class Port:
-    """A hand that keeps every command and answers with scripted angles."""
-
-    def __init__(self, *angles):
-        self.angles, self.commands, self.counts = list(angles), [], LinkCounts()
-
-    def exchange(self, command):
-        self.commands.append(command)
-        state = frames.empty_state()
-        state["joint"]["position"] = self.angles[min(len(self.commands), len(self.angles)) - 1]
-        return Reply(state, CYCLE * len(self.commands), CYCLE * (len(self.commands) + 1), len(self.commands), 1)
-
-    def close(self):
-        pass
-
-
 def test_a_command_that_is_not_finite_never_leaves(hand):
     sensing = HandSensing(hand, HardwareConfig())
     for bad in (np.nan, np.inf, 1e300):
         with pytest.raises(HandError, match="not finite"), np.errstate(over="ignore"):
             sensing.command(np.full(12, bad), Mode.POSITION)
-
-
-def test_one_huge_frame_leaves_no_trace_in_the_velocity(hand):
-    """Finite to the end of a float: the filter must not keep it."""
-    port = Port(MIDDLE, MIDDLE, MIDDLE, MIDDLE, wrong(4, 1e30), MIDDLE)
-    sensing = HandSensing(hand, HardwareConfig())
-    safety = Safety(hand, SafetyConfig())
-    servo = LoopThread(port, sensing, safety, 83.0)
-    for _ in range(10):
-        servo.cycle()
-    assert safety.counts["implausible: measurement"] == 1 and safety.sample.sequence == 10
-    np.testing.assert_allclose(safety.sample.velocity, 0.0, atol=1e-6)

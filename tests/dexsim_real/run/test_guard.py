@@ -1,6 +1,8 @@
 """The guard process: a runner that freezes, or that reaches its hand over a port of somebody's own."""
 
 import contextlib
+import os
+import select
 import signal
 import subprocess
 import sys
@@ -16,7 +18,9 @@ from pty_hand import QUICK
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.motors_off import PATIENCE
 from dexsim_real.control.safety import Safety
+from dexsim_real.core.errors import HandError
 from dexsim_real.loop import LoopThread
+from dexsim_real.run import guard
 from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
@@ -29,12 +33,11 @@ from dexsim_real.run.guard import Guard
 from dexsim_real.wire.link import LinkConfig
 guard = Guard(sys.argv[1], LinkConfig(settle=0.0, margin=0.02, handshake=0.1, paced=False))
 guard.arm()
-guard.beat(*map(float, sys.argv[2:]))
+guard.beat()
 print("armed", flush=True)
-while len(sys.argv) < 3:
+while True:
     guard.beat()
     time.sleep(0.01)
-time.sleep(60)
 """
 
 
@@ -45,9 +48,9 @@ def peer():
 
 
 @contextlib.contextmanager
-def guarded(peer, *words):
-    """A runner under guard; with a time s its last sign of life, which says by how much the next one may be late."""
-    process = subprocess.Popen([sys.executable, "-c", RUNNER, peer.port, *words], cwd=ROOT, stdout=subprocess.PIPE)
+def guarded(peer):
+    """A runner under guard."""
+    process = subprocess.Popen([sys.executable, "-c", RUNNER, peer.port], cwd=ROOT, stdout=subprocess.PIPE)
     try:
         assert process.stdout.readline() == b"armed\n"
         yield process
@@ -66,17 +69,43 @@ def test_a_frozen_runner_is_killed_and_its_hand_turned_off(peer):
         assert peer.commands and not peer.on().any()
 
 
-@pytest.mark.slow
-def test_who_counts_as_frozen(peer):
-    """Not who gives signs of life, pauses briefly, or has asked for the time, as a runner does that stops its hand."""
-    with guarded(peer) as living, guarded(peer) as paused, guarded(peer, "5") as patient:
-        paused.send_signal(signal.SIGSTOP)
-        time.sleep(0.7)
-        paused.send_signal(signal.SIGCONT)
-        time.sleep(2.0)
-        assert [process.poll() for process in (living, paused, patient)] == [None] * 3 and not peer.commands
-        with guarded(peer, "0.1") as silent:
-            assert silent.wait(FREEZE) == -signal.SIGKILL
+@pytest.mark.parametrize("wakes", [True, False])
+def test_a_machine_that_paused_gets_a_second_look(monkeypatch, wakes):
+    """When all of it stood still, the runner's sign is overdue as the guard wakes, and comes a moment later."""
+    near, far = os.pipe()
+    os.write(far, b"0.05\n")
+    real, looks = select.select, []
+
+    def look(read, write, error, seconds):
+        looks.append(seconds)
+        if len(looks) == 3 and wakes:
+            os.write(far, b"off\n")
+            os.close(far)
+        return real(read, write, error, seconds)
+
+    monkeypatch.setattr(guard.select, "select", look)
+    assert guard._watch(near, os.open(os.devnull, os.O_WRONLY)) == ("" if wakes else guard._FROZEN)
+    assert looks[2] == guard._MOMENT
+
+
+def test_a_suspended_guard_is_noticed_within_a_second(peer):
+    watched = Guard(peer.port, QUICK)
+    watched.arm()
+    try:
+        for _ in range(20):
+            watched.beat()
+            watched.check()
+            time.sleep(0.02)
+        os.kill(watched._process.pid, signal.SIGSTOP)
+        begin = time.monotonic()
+        with pytest.raises(HandError, match="the guard process stands still"):
+            while time.monotonic() < begin + 10:
+                watched.beat()
+                watched.check()
+                time.sleep(0.02)
+        assert guard._ANSWER + guard._MOMENT < 1.0, "s, on a machine that is not busy"
+    finally:
+        watched._process.kill()
 
 
 def test_the_exchange_thread_gives_the_signs_of_life(hand):
@@ -106,27 +135,6 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
     assert events[last + 1 :] == ["answered"]
 
 
-@pytest.mark.parametrize("attempts", [1, 3])
-def test_the_guard_stops_a_hand_on_somebodys_own_port(peer, tmp_path, monkeypatch, attempts):
-    """A port that fails at first is opened again."""
-    (tmp_path / "my_sdk.py").write_text(
-        "from dexsim_real.wire.serial_hand import SerialHand\n"
-        "opened = []\n"
-        "def open_hand(config):\n"
-        "    opened.append(config)\n"
-        f"    if len(opened) < {attempts}:\n"
-        "        raise RuntimeError('busy')\n"
-        f"    return SerialHand({peer.port!r}, config)\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    guard = Guard("sdk:my_sdk:open_hand", QUICK)
-    guard.arm()
-    assert not peer.commands
-    guard.dismiss(off=False)
-    assert guard._process.wait(10) == 0
-    assert peer.commands and not peer.on().any()
-
-
 def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(peer, tmp_path, monkeypatch):
     """What it prints is no word of the guard's, and has no reader once the runner is gone."""
     (tmp_path / "loud_sdk.py").write_text(
@@ -151,8 +159,8 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(p
         f"    return Loud({peer.port!r}, config)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    guard = Guard("sdk:loud_sdk", QUICK)
-    guard.arm()
-    guard.dismiss(off=False)
-    assert guard._process.wait(10) == 0
+    armed = Guard("sdk:loud_sdk", QUICK)
+    armed.arm()
+    armed.dismiss(off=False)
+    assert armed._process.wait(10) == 0
     assert peer.commands and not peer.on().any()

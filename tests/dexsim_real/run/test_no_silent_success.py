@@ -9,10 +9,6 @@ import time
 
 import numpy as np
 import pytest
-from calibrating import QUICK, plates
-from calibrating import arguments as press_arguments
-from calibrating import record as record_presses
-from press_bench import BenchHand
 
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, summary
@@ -21,12 +17,12 @@ from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core import log
-from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import LogWriter
 from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.run.outcome import Outcome
 from dexsim_real.sensors.camera import encode_mask
+from dexsim_real.wire.refusals import Refusal
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
@@ -52,19 +48,6 @@ def test_a_hand_that_was_gone_for_most_of_the_run(tmp_path, capsys):
     assert summary(tmp_path)["end"] == "time is over" and summary(tmp_path)["motors_off"]
     (line,) = lines(capsys)
     assert "no measurement for " in line and "the policy were not finite" not in line
-
-
-def test_a_hand_that_is_stopped_on_its_way_to_the_start_posture(tmp_path, capsys):
-    """As in the run itself: its motors were on."""
-
-    def heat(index, state):
-        state["joint"]["temperature"] = 30 if index < 50 else 95
-
-    with FollowingHand(heat) as peer:
-        assert run.main(arguments(peer, tmp_path, "--place", "20")) == 1
-        assert peer.on().any() and not peer.on()[-1]
-    end = summary(tmp_path)["end"]
-    assert end.startswith("stopped: too hot") and lines(capsys) == [f"error: {end}"]
 
 
 def test_a_policy_whose_actions_are_not_finite(tmp_path, capsys, monkeypatch):
@@ -130,45 +113,26 @@ def test_a_full_disk(tmp_path, capsys, monkeypatch):
     assert f"{summary(tmp_path)['log_dropped']} log records are lost" in line and "No space left on device" in line
 
 
-def test_a_calibration_whose_presses_are_lost_is_none(hand, tmp_path, monkeypatch):
-    """While it presses, or in the end if the records reach the disk later than the presses are made."""
-    full_after(monkeypatch, 100_000)
-    options = press_arguments(tmp_path, press=QUICK, sides=False)
-    with pytest.raises(HandError, match=r"(stopped: the log is|log records are) lost .*No space left"):
-        record_presses(BenchHand(hand, plates(hand, "index pad")), hand, options)
-    real = LogWriter.close
-
-    def close(self):
-        real(self)
-        self.dropped = 7
-
-    monkeypatch.undo()
-    monkeypatch.setattr(LogWriter, "close", close)
-    options = dataclasses.replace(options, log=tmp_path / "b.log")
-    with pytest.raises(HandError, match="7 log records are lost .the disk is too slow."):
-        record_presses(BenchHand(hand, plates(hand, "index pad")), hand, options)
-
-
 def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
-    """A tenth of the time without a measurement, half of it held."""
+    """A tenth of the time without a measurement, half of it held or with the motors off."""
     with LogWriter(tmp_path / "a.log") as writer:
         pass
     safety = Safety(hand, SafetyConfig())
-    safety.engaged = True
 
-    def outcome(blind, held):
-        found = Outcome(5.0)
+    def missing(blind=0, held=0, reaction=Reaction.HOLD, engaged=True):
+        outcome, safety.engaged = Outcome(5.0), engaged
         for k in range(100):
-            safety.last = (Reaction.HOLD, "a joint is too fast") if k < held else (Reaction.CLIP, "")
-            found.add(5.0 + (k + 1) / 100, k >= blind, safety)
-            found.act(np.zeros(12))
-        return found.missing(writer)
+            safety.last = (reaction, "a joint is too fast") if k < held else (Reaction.CLIP, "")
+            outcome.add(5.0 + (k + 1) / 100, None if k < blind else np.zeros(12), safety)
+        return outcome.missing(writer)
 
-    assert outcome(0, 0) == outcome(9, 49) == []
-    assert outcome(11, 0) == ["no measurement for 11 % of the run"]
-    assert outcome(0, 51) == ["the hand was held for 51 % of the run, last because: a joint is too fast"]
-    safety.engaged = False
-    assert outcome(0, 100) == []
+    assert missing() == missing(9, 49) == missing(held=100, engaged=False) == []
+    assert missing(blind=11) == ["no measurement for 11 % of the run"]
+    for reaction in (Reaction.HOLD, Reaction.RELAX):
+        (line,) = missing(held=51, reaction=reaction)
+        assert line == "the hand was held for 51 % of the run, last because: a joint is too fast"
+    safety.refuse(Refusal("the hand reports busy", serious=False))
+    assert missing(blind=50) == ["no measurement for 50 % of the run (the hand reports busy)"]
 
 
 def test_a_taxel_that_gets_stuck_does_not_end_the_grasp(tmp_path, capsys):

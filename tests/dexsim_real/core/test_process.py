@@ -1,16 +1,19 @@
-"""Which of the bridge's threads the machine runs first."""
+"""Which of the bridge's threads the machine runs first, and Ctrl-C before there are any."""
 
 import os
+import subprocess
+import sys
 import threading
 import time
 
 import pytest
+from paths import ROOT
 
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.log import LogWriter
-from dexsim_real.core.process import lower_priority, raise_priority, use_realtime
+from dexsim_real.core.process import use_realtime
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 
@@ -67,10 +70,18 @@ def test_exchanges_come_first_and_the_log_last(tmp_path):
     assert found[0] > found[1] > found[2] > 0
 
 
-def test_ordinary_threads_stay_ordinary():
-    def shifted():
-        raise_priority()
-        lower_priority()
-        return os.sched_getscheduler(0)
+@pytest.mark.parametrize("module", ["dexsim_real.run", "dexsim_real.replay"])
+def test_ctrl_c_while_modules_load_is_one_line(module):
+    script = f"""
+import os, runpy, signal, sys
 
-    assert in_thread(shifted) == os.SCHED_OTHER
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "jax":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+runpy.run_module({module!r}, run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")

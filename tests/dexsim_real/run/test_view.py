@@ -1,9 +1,10 @@
-"""The first run on a hand: what is shown of it, and the question before the motors come on."""
+"""What is shown of a run, and the question before the motors come on."""
 
 import io
 import os
 import re
 import select
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,12 +14,10 @@ from rich.console import Console
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records
 
-from dexsim.core import cli
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
 from dexsim_real.run import __main__ as run
-from dexsim_real.run import consent, status
-from dexsim_real.run.hand_view import HandState, hand_line
+from dexsim_real.run import session, status
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
 
@@ -38,13 +37,12 @@ def state(hand):
     tip["taxel"]["z"][:, :3] = np.arange(200, 205)[:, None]
     tip["temperature"] = np.arange(121, 126)
     measured = HandSensing(hand, HardwareConfig()).measure(block)
-    return HandState(hand, measured, np.linspace(-0.202, 1.8, 12), sent=True)
+    return status.HandState(hand, measured, np.linspace(-0.202, 1.8, 12), sent=True)
 
 
-def picture(state, rows=12):
+def picture(state):
     """The view on a terminal of 100 columns, as text."""
-    texts = {f"row {number}": "x" * 80 for number in range(rows)}
-    view = status.StatusView("a title", lambda: status.Status(texts, state))
+    view = status.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: state)
     view.console = Console(width=100, file=io.StringIO())
     view.show()
     return view.console.file.getvalue()
@@ -64,19 +62,65 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand, state)
     for finger, name in enumerate(FINGERS):
         assert re.search(rf"{name} +{60 + 0.3 * finger:.1f} +{121 + finger}$", shown, re.MULTILINE)
     assert re.search(r"sum +303.0 *$", shown, re.MULTILINE) and re.search(r"palm board +42$", shown, re.MULTILINE)
+    assert "not sent" not in shown
+    quiet = picture(status.HandState(hand, state.measured, None, sent=False))
+    assert "(not sent)" in quiet and "target" not in quiet
 
 
-def test_targets_that_are_not_sent_are_called_so(hand, state):
-    quiet = HandState(hand, state.measured, None, sent=False)
-    assert "(not sent)" in picture(quiet) and "target" not in picture(quiet)
-    assert "not sent" not in picture(state) and "  target  " in picture(state)
+def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(status, "_LINES", 0.25)
+    with FollowingHand() as peer:
+        options = [o for o in arguments(peer, tmp_path, "--seconds", "0.9", "--motors-off") if o != "--quiet"]
+        assert run.main(options) == 0
+        assert peer.commands and not peer.on().any()
+    assert len(records(tmp_path, Kind.TICK)) >= 5
+    shown = capsys.readouterr().err
+    for text in ("firmware 1.3.9", "the policy starts", " | exchange jitter count ", "end: time is over", "round trip"):
+        assert text in shown, text
 
 
-def test_without_a_terminal_the_same_is_one_line(state):
-    words = hand_line(state)
-    assert words["errors"] == "index_bend palm 0x0101, joint 0xffff; pinky_joint2 tip 0x8000"
-    assert words["heat"] == "pinky_joint2 112, tip of the pinky 125, palm 42 degC"
-    assert words["force"].startswith("thumb 60.0, index 60.3") and words["force"].endswith("sum 303.0 N")
+def test_the_live_table_and_text_in_brackets(monkeypatch):
+    """Such as a driver's error that names its port: to Rich it is markup, or an error."""
+    text = "cannot open [/dev/ttyUSB0] [bold]"
+    monkeypatch.setenv("TERM", "xterm")
+    shown = io.StringIO()
+    console = Console(file=shown, force_terminal=True, width=200)
+    monkeypatch.setattr(status, "Console", lambda **options: console)
+    monkeypatch.setattr(status, "_LIVE", 0.02)
+    with status.StatusView(f"title {text}", lambda: {"problem": f"row {text}"}, lambda: None) as live:
+        live.note("something happened")
+        while "row" not in shown.getvalue():
+            time.sleep(0.01)
+    status.show_summary("end", {"end": f"cell {text}", "empty": "", "link": {"sent": 3, "late": 0}})
+    for part in (f"title {text}", f"row {text}", f"cell {text}", "something happened", "sent 3"):
+        assert part in re.sub("\x1b\\[[0-9;]*m", "", shown.getvalue())
+    assert "late" not in shown.getvalue() and "empty" not in shown.getvalue()
+
+
+@pytest.mark.parametrize("gone", ["window", "pipe"])
+def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
+    """An SSH connection that broke, a `tee` that Ctrl-C ended: with Rich alone the exchange thread would end."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(status, "_LIVE", 0.02)
+    far, near = os.openpty() if gone == "window" else os.pipe()
+    screen = os.fdopen(near, "w", buffering=1)
+    monkeypatch.setattr("sys.stderr", screen)
+    view = status.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: None)
+    os.close(far)
+    try:
+        view.note("before")
+        view.show()
+        with pytest.raises(SystemExit, match="129"), view:
+            time.sleep(0.1)
+            raise SystemExit(129)
+        view.note("end")
+    finally:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), near)  # What the stream still holds can be written now.
+        screen.close()
+
+
+# --- the question --------------------------------------------------------------------------------
 
 
 class Terminal(io.StringIO):
@@ -138,7 +182,7 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
             error = SimpleNamespace(write=lambda text: os.write(master, b"n\n"), flush=lambda: None)
             monkeypatch.setattr("sys.stderr", error)
             with pytest.raises(HandError, match="the motors stayed off"):
-                consent.ask()
+                session.ask()
     finally:
         os.close(master)
 
@@ -148,21 +192,6 @@ def test_a_script_must_say_yes(tmp_path, monkeypatch, capsys, missing):
     with FollowingHand() as peer:
         monkeypatch.setattr("sys.stdin" if missing == "stderr" else "sys.stderr", Terminal("y\n", peer))
         options = [o for o in arguments(peer, tmp_path) if o != "--yes"]
-        with pytest.raises(HandError, match="give --yes .* or --motors-off"):
+        with pytest.raises(HandError, match="give --yes or --motors-off"):
             run.main(options)
         assert not peer.commands
-
-
-def test_the_refusal_is_one_line(tmp_path, capsys):
-    with FollowingHand() as peer:
-        options = [o for o in arguments(peer, tmp_path) if o != "--yes"]
-        with pytest.raises(SystemExit) as stop:
-            cli.run(lambda _: run.main(options))
-    error = capsys.readouterr().err.strip().splitlines()
-    assert stop.value.code == 2 and len(error) == 1 and error[0].startswith("error: nobody can be asked")
-
-
-def test_a_closed_input_is_no_terminal(monkeypatch):
-    monkeypatch.setattr("sys.stdin", None)
-    with pytest.raises(HandError, match="--yes"):
-        consent.check_terminal()
