@@ -86,8 +86,8 @@ def find_preset(name: str, task: str) -> Preset:
         return replace(preset, ppo=replace(preset.ppo, discount=0.97))
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
-    if not cpu:  # A quarter of the environments: four times the updates from the same experience, for the gait.
-        return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
+    if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
+        return replace(preset, ppo=replace(ppo, num_envs=16384, memory="none"), minutes=5.0)
     curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":

@@ -32,7 +32,7 @@ def compile_scene(
     target,
     *,
     gravity=GRAVITY,
-    timestep=0.006,
+    timestep=0.01,
     iterations=3,
     line_search=6,
     condim=3,
