@@ -75,7 +75,7 @@ def test_a_grip_and_a_slide_are_c_mujocos(hand, worlds, mjx_physics, backend):
     tick = jit(jax.vmap(lambda o, s, torque, push: physics.advance(lambda *_: torque, o, s, push)), once=True)
     after, pressed = tick(*inputs)
     assert np.linalg.norm(force[:3], axis=-1).max(-1).min() > 0.5, "a hand holds nothing: the test tests nothing"
-    assert not np.any(force[3]) and velocity[3, 13] < before[3, 13] - 0.05, "no friction on the palm"
+    assert not np.any(force[3]) and velocity[3, 13] < before[3, 13] - 0.02, "no friction on the palm"
     np.testing.assert_allclose(pressed, force, atol=0.02)
     np.testing.assert_allclose(after.qvel, velocity, atol=5e-3)
 
