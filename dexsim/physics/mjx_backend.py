@@ -1,4 +1,8 @@
-"""MuJoCo's own `mjx.step`: any device, differentiable."""
+"""MuJoCo's own `mjx.step`: any device, with gradients.
+
+`jax.jvp` and `jax.jacfwd` go through it. MJX's solver is a loop without a reverse unless it is one iteration long, so
+`jax.grad` needs `PhysicsConfig.iterations` 1.
+"""
 
 from typing import Any
 
