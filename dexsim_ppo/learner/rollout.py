@@ -63,7 +63,7 @@ def collect_rollout(
         obs = dict(env_state.obs)
         next_carry, mean = actor_step(config, params, normalizers, obs, carry)
         action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
-        after = step_env(env_state, distribution.squash(action, config.distribution))
+        after = step_env(env_state, jnp.clip(action, -1.0, 1.0))
         record = Rollout(
             obs=obs,
             decision=Decision(action, mean, distribution.log_prob(action, mean, params.log_std)),
@@ -160,12 +160,11 @@ def scan_restarting(
     return state, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), outputs)
 
 
-def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tuple[Rollout, jax.Array]:
+def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax.Array]:
     """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations.
 
     Args:
-      returns: statistics of the returns so far [], in units of scaled rewards.
-      scale: factor on rewards.
+      returns: statistics of the returns so far [].
 
     Returns:
       The experience, and the number [] of rewards that were bounded.
@@ -173,8 +172,8 @@ def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tupl
     size = jnp.abs(rollout.reward).reshape(-1)
     others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
     spread = jnp.sqrt(jnp.mean(others**2))
-    at_first = _FAR_AT_FIRST * jnp.where(spread > 0, spread, 1.0 / scale)  # A sparse reward may come once.
-    limit = jnp.where(returns.count > 0, _FAR * value_std(returns) / scale, at_first)
+    at_first = _FAR_AT_FIRST * jnp.where(spread > 0, spread, 1.0)  # A sparse reward may come once.
+    limit = jnp.where(returns.count > 0, _FAR * value_std(returns), at_first)
     bounded = jnp.sum(size > limit, dtype=jnp.float32)
     return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded
 

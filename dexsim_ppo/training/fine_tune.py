@@ -32,7 +32,6 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
         memory="gru" if units else "none",
         memory_size=units or config.memory_size,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
-        distribution=policy.params.squash,
         observation_clip=normalizer.clip,
         observation_std_floor=floor,
         learning_rate=1e-5,
@@ -56,7 +55,7 @@ def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
         different = sorted({entry.name for entry in set(theirs) ^ set(mine)})
         raise ConfigError(f"observations of policy and environment differ: {', '.join(different) or 'their order'}")
     network = fine_tuning_config(policy, config)
-    for name in ("memory", "memory_size", "actor_layers", "distribution"):
+    for name in ("memory", "memory_size", "actor_layers"):
         if getattr(config, name) != getattr(network, name):
             raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: the policy has {getattr(network, name)}")
     if (actions := policy.params.layers[-1].bias.size) != env.action_size:
