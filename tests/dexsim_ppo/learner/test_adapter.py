@@ -15,10 +15,9 @@ from reach_env import MAX_STEPS, Reach
 from tiny_env import SMALL
 
 from dexsim import registry
-from dexsim.errors import ConfigError, DexsimError
-from dexsim.tasks.grasp.config import GraspConfig
-from dexsim_ppo import CurriculumConfig, evaluate_policy, load_policy, make_train, reproduce, train_policy
+from dexsim.errors import ConfigError
 from dexsim_ppo import evaluate as evaluate_command
+from dexsim_ppo import evaluate_policy, load_policy, make_train, train_policy
 from dexsim_ppo.learner.adapter import adapt
 
 
@@ -64,46 +63,12 @@ def test_the_time_limit_truncates_and_a_terminal_state_terminates():
     assert ended.terminated and not ended.truncated
 
 
-def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
-    env = adapt(Reach(), "reach")
-    state = play(env, [0.3, 0.3])[-1]
-    same, fresh = (jax.jit(env.restart)(state, jnp.bool_(done)) for done in (False, True))
-    np.testing.assert_array_equal(same.inner["x"], state.inner["x"])
-    assert fresh.inner["x"] != state.inner["x"] and fresh.clock == 0 and fresh.metrics["length"] == 0
-    again = jax.jit(env.restart)(same, jnp.bool_(True))
-    assert again.inner["x"] != fresh.inner["x"]
-    clocks = jax.vmap(lambda key: env.randomize_episode_time(state, key).clock)(
-        jax.random.split(jax.random.key(1), 200)
-    )
-    assert set(np.asarray(clocks).tolist()) == set(range(MAX_STEPS))
-
-
 def test_make_train_adapts_and_leaves_complete_environments_alone():
     training = make_train(Reach(), SMALL)
     state, metrics = training.step(training.init(jax.random.key(0)))
     assert int(state.iteration) == 1 and np.isfinite(metrics["step/distance"]).all()
     env = adapt(Reach(), "reach")
     assert adapt(env, "other") is env and adapt(Reach()).name == "Reach"
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"observation_size": 3}, r"observation must have the shape \(3,\), got \(2,\)"),
-        ({"action_size": 0}, "expected action_size to be a whole number of at least 1, got 0"),
-        ({"max_steps": 2.0}, "max_steps .* got 2.0"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(1), jnp.bool_(False))}, r"reward must have the shape"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(()), jnp.zeros(()))}, "terminated must be bool"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s["x"], jnp.zeros(()), jnp.bool_(False))}, "of the form of reset's"),
-    ],
-)
-def test_what_does_not_fit_is_one_line(change, message):
-    env = Reach()
-    for name, value in change.items():
-        setattr(env, name, value)
-    with pytest.raises(ConfigError, match=message) as error:
-        adapt(env, "reach")
-    assert "'reach'" in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
         adapt({}, "nothing")
 
@@ -125,26 +90,6 @@ def test_float64_is_an_error_before_anything_is_compiled():
 def test_bad_names_are_one_line(name, message):
     with pytest.raises(ConfigError, match=message):
         train_policy(name, ppo=SMALL, steps=64)
-
-
-def test_settings_that_it_does_not_have_are_errors(tmp_path):
-    for config, options, message in (
-        (GraspConfig(), {}, "takes no config"),
-        (None, {"curriculum": CurriculumConfig(on=True)}, "no ranges that could widen"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            train_policy("reach_env:reach", config, ppo=SMALL, steps=64, run_dir=tmp_path / "run", **options)
-        assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_fault_is_replayed(tmp_path, capsys):
-    sizes = {"evaluation_chunk": 8, "evaluation_episodes": 8}
-    with pytest.raises(DexsimError, match="training diverged.* --task reach_env:breaks$"):
-        train_policy("reach_env:breaks", ppo=SMALL, steps=1e5, run_dir=tmp_path / "run", **sizes)
-    file = sorted((tmp_path / "run").glob("reproduce-*.msgpack"))[0]
-    assert reproduce.main([str(file), "--task", "reach_env:breaks"]) == 0
-    assert re.search(r"'observation': \d+ of \d+ environments .*, first at step", capsys.readouterr().out)
 
 
 @pytest.mark.slow

@@ -1,19 +1,16 @@
 """Two trainings from one seed are the same to the last bit: on a CPU always, on a GPU with `--deterministic`."""
 
-import json
 import subprocess
 import sys
 
 import jax
 import numpy as np
 import pytest
-import tiny_train
 from paths import ROOT
 
 import dexsim
-from dexsim.core import compilation
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim_ppo import checkpoint, train
+from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.runlog import RunFolder
@@ -34,25 +31,6 @@ def unequal(first, second):
 
 
 @pytest.mark.slow
-def test_physics_in_jax_repeats_to_the_bit_and_worlds_do_not_mix():
-    env = dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=8)
-    begin = compilation.jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), 8))
-    step = jax.jit(jax.vmap(env.step))
-
-    def episode(seed, order=slice(None)):
-        state = jax.tree.map(lambda x: x[order], begin)
-        for key in jax.random.split(jax.random.key(seed), 20):
-            action = jax.random.uniform(key, (8, 12), minval=-1.0, maxval=1.0)
-            state = step(state, action[order])
-        return plain(state)
-
-    once, order = episode(1), np.array([3, 1, 7, 0, 5, 2, 6, 4])
-    assert not unequal(episode(1), once)
-    assert unequal(episode(2), once), "else the comparison sees nothing"
-    assert not unequal(episode(1, order), {path: x[order] for path, x in once.items()})
-
-
-@pytest.mark.slow
 def test_training_on_c_repeats_to_the_bit():
     """Though its worlds are stepped by several threads."""
     env = dexsim.make("grasp", GraspConfig(pool_size=80, episode_seconds=0.6), backend="c", num_envs=8)
@@ -68,17 +46,6 @@ def test_training_on_c_repeats_to_the_bit():
 
     assert not unequal(train_from(0), train_from(0))
     assert unequal(train_from(0), train_from(1)), "else the comparison sees nothing"
-
-
-def test_the_option_is_kept_and_on_a_cpu_says_that_it_changes_nothing(monkeypatch, tmp_path, capsys):
-    tiny_train.install(monkeypatch)
-    sizes = "--ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8 --ppo.critic-layers 8 --steps 128".split()
-    sizes += "--evaluation-chunk 16 --evaluation-episodes 16 --no-video --preset cpu".split()
-    folder = RunFolder(tmp_path / "a")
-    assert train.main(["--task", "tiny", "--deterministic", *sizes, "--run-dir", str(folder.path)]) == 0
-    assert "--deterministic changes nothing here" in capsys.readouterr().out
-    assert json.loads(folder.config.read_text())["arguments"]["deterministic"] is True
-    assert not compilation.is_deterministic()
 
 
 @pytest.mark.gpu

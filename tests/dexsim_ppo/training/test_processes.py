@@ -1,11 +1,9 @@
 """What one process of several does and does not, with the others made up."""
 
-import os
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -23,12 +21,6 @@ def several(monkeypatch):
         monkeypatch.setattr(jax, "process_index", lambda: index)
 
     return be
-
-
-def test_alone_it_asks_nobody_and_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "multihost_utils", None)
-    assert processes.is_first() and processes.agree(7) == 7
-    assert processes.agree_on_path(tmp_path) is tmp_path
 
 
 def test_all_stop_when_one_does(several, monkeypatch):
@@ -52,12 +44,13 @@ def test_the_path_is_that_of_the_first_process(path, several, monkeypatch):
 
 def test_a_checkpoint_is_gathered_by_all_and_written_by_the_first(several, monkeypatch, tmp_path):
     gathered, written = [], []
-    monkeypatch.setattr(processes, "mesh_of", lambda tree: "mesh")
     monkeypatch.setattr(processes, "copied", lambda tree, mesh: gathered.append(mesh) or tree)
+    state = SimpleNamespace(iteration=SimpleNamespace(sharding=SimpleNamespace(mesh="mesh")))
+    monkeypatch.setattr(jax, "jit", lambda function: function)
     monkeypatch.setattr(checkpoint, "save", lambda path, **content: written.append((path, content["task"])))
     for index in range(3):
         several(index)
-        processes.save(tmp_path / "c", tree={"x": jnp.zeros(index + 1)}, kind="train", task="tiny", content={})
+        processes.save(tmp_path / "c", tree=state, kind="train", task="tiny", content={})
     assert gathered == ["mesh"] * 3 and written == [(tmp_path / "c", "tiny")]
 
 
@@ -102,19 +95,3 @@ def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, 
             fail(text)
     with pytest.raises(ValueError, match="shapes"):
         fail("shapes do not match")
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [(DexsimError("a\nline"), "error: a line\n"), (ZeroDivisionError("why"), "ZeroDivisionError: why")],
-)
-def test_a_process_of_several_ends_at_once(error, said, monkeypatch, capsys):
-    with pytest.raises(type(error)), processes.exit_on_error():
-        raise error
-    ended = []
-    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(os, "_exit", ended.append)
-    with processes.exit_on_error():
-        raise error
-    assert ended == [2]
-    assert said in capsys.readouterr().err

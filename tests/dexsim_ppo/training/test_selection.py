@@ -7,7 +7,6 @@ import types
 import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
-from dexsim.core.errors import ConfigError
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder
@@ -73,11 +72,6 @@ def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
     assert run._is_evaluation_due(4, rate) and not run._is_evaluation_due(
         4, rate / 2
     )  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
-
-
-def test_patience_needs_evaluations():
-    with pytest.raises(ConfigError, match=r"TrainArguments\.patience = 2: needs evaluations"):
-        dataclasses.replace(ARGUMENTS, evaluate_every=0)
 
 
 def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
