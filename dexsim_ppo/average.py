@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict, to_dict
+from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.acting import PolicyParams
@@ -98,16 +98,9 @@ def _policy_at(path: Path, last: Policy) -> Policy:
 
 def _form(policy: Policy) -> dict[str, Any]:
     """What averaged policies must have in common."""
-    return {
-        "task": policy.task,
-        "control": policy.spec and to_dict(policy.spec.control),
-        "control rate": policy.control_rate,
-        "hand": policy.hand,
-        "observation": policy.observation_layout,
-        "clip of the observation": policy.params.normalizer.clip,
-        "memory": carry_size(policy.params.memory),
-        "layers": [layer.kernel.shape for layer in policy.params.layers],
-    }
+    header = {name: value for name, value in policy.header().items() if name not in ("training", "env_config")}
+    network = {"network": [layer.kernel.shape for layer in policy.params.layers]}
+    return {"task": policy.task} | header | network | {"memory": carry_size(policy.params.memory)}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

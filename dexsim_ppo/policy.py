@@ -158,14 +158,11 @@ class Policy:
         self.check_env(env)
         return cast(Any, env)
 
-    def check_env(self, env: Environment) -> None:
-        """Whether an environment is the one that the policy was trained in.
-
-        Warns (`OtherEnvWarning`) of settings that differ.
+    def check_fit(self, env: Environment) -> None:
+        """Whether the policy can act in an environment.
 
         Raises:
-          CheckpointError: the environment's observation has another layout than the policy's, or it takes other
-            actions.
+          CheckpointError: it observes something else, or takes other actions.
         """
         layouts = tuple(env.observation_layout["actor"]), self.observation_layout
         if layouts[0] != layouts[1]:
@@ -173,6 +170,15 @@ class Policy:
             raise CheckpointError(f"{env.name} observes {given}; the policy expects {expected}")
         if (actions := self.params.layers[-1].bias.size) != env.action_size:
             raise CheckpointError(f"{env.name} takes {env.action_size} actions; the policy gives {actions}")
+
+    def check_env(self, env: Environment) -> None:
+        """Whether an environment is the one that the policy was trained in; warns (`OtherEnvWarning`) of settings that
+        differ.
+
+        Raises:
+          CheckpointError: the policy cannot act in it; see `check_fit`.
+        """
+        self.check_fit(env)
         today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
         trained, now = flat(to_dict(today)), flat(to_dict(env.config))
         changed = [

@@ -50,7 +50,7 @@ from dexsim_ppo.training.arguments import (
     printable,
     training_config,
 )
-from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
+from dexsim_ppo.training.fine_tune import check_network, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, draw_curve, folder_of, new_folder, read_metrics, taken
 from dexsim_ppo.training.trainer import Run
@@ -179,7 +179,8 @@ def make_run(
         # XLA's compiler crashes on Warp's calls in a program of several devices (JAX 0.11.2).
         raise ConfigError(f"TrainArguments.devices = {mesh.size}: Warp runs on one device; choose another --backend")
     if isinstance(source, Policy):
-        check_fit(source, env, arguments.ppo)
+        source.check_fit(env)
+        check_network(source, arguments.ppo)
     path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
     folder = RunFolder(processes.agree_on_path(path))
     if first and not resumed:

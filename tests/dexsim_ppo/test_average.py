@@ -55,12 +55,12 @@ def test_what_has_no_common_origin_is_refused(tmp_path):
     stranger = moved(clear, 20.0, 0)
     with pytest.raises(ConfigError, match=r"policy 3 has no common origin with the first: weights differ by \d+%"):
         average_policies([clear, moved(clear, 0.1, 1), stranger])
-    with pytest.raises(ConfigError, match="policy 2 differs from the first in observation, memory, layers"):
+    with pytest.raises(ConfigError, match="policy 2 differs from the first in observation_layout, .*memory"):
         average_policies([rotate, load_policy("rotate_without_orientation")])
     with pytest.raises(ConfigError, match="policy 2 differs from the first in task"):
         average_policies([rotate, load_policy("grasp")])
     other = dataclasses.replace(rotate.spec, control=dataclasses.replace(rotate.spec.control, step=0.5))
-    with pytest.raises(ConfigError, match="policy 2 differs from the first in control$"):
+    with pytest.raises(ConfigError, match="policy 2 differs from the first in spec$"):
         average_policies([rotate, dataclasses.replace(rotate, spec=other)])
     with pytest.raises(ConfigError, match="two policies or more"):
         average_policies([rotate])

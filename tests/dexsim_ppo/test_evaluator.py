@@ -1,6 +1,8 @@
 """How many episodes are measured and which, and what is made of the totals of long ones."""
 
+import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.render import render
 from dexsim_ppo import evaluate, load_policy
 from dexsim_ppo.learner.ppo import make_train
@@ -60,8 +63,31 @@ def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
     assert number(4000) == chunk() == 1024
 
 
-def test_a_film_is_shown_to_a_minute(policy):
-    """Of each of the two episodes."""
+@pytree_dataclass
+class Commanded:
+    """What a film of `Commands` holds."""
+
+    command: Any
+
+
+class Commands(TinyEnv):
+    """The target is what is commanded; every episode ends at step 7."""
+
+    def snapshot(self, state):
+        return Commanded(state.target)
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, terminated=state.metrics["length"] == 7)
+
+
+def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_the_end(policy):
+    """And at most a minute of each."""
+    env = Commands()
+    _, film = evaluate.Evaluator(env, 8)(policy.params, episodes=8, seed=0)
+    starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
+    shown = np.asarray(film.command).reshape(2, 6 + 5)
+    np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
     env = TinyEnv()
     env.control_period, env.evaluation_steps = 0.5, 130
     _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)

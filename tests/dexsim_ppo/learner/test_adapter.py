@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import subprocess
 import sys
 
@@ -111,60 +110,6 @@ def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, caps
         + ["--seed", "3", "--output", str(tmp_path / "report.json")]
     )
     assert code == 0 and f"{report['return']['value']:.4g}" in capsys.readouterr().out
-
-
-class Params:
-    """As gymnax's: a frozen record with `replace`."""
-
-    def __init__(self, max_steps_in_episode=200):
-        self.max_steps_in_episode = max_steps_in_episode
-
-    def replace(self, **changes):
-        return Params(**changes)
-
-
-class Box:
-    def __init__(self, low, high, shape):
-        self.low, self.high, self.shape = low, high, shape
-
-
-class GymnaxPendulum:
-    """gymnax's functions for a pendulum in a few lines, its time limit inside."""
-
-    def observation_space(self, params):
-        return Box(-jnp.ones(3), jnp.ones(3), (3,))
-
-    def action_space(self, params):
-        return Box(-2.0, 2.0, (1,))
-
-    def reset_env(self, key, params):
-        theta, speed = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
-        state = {"theta": theta, "speed": speed, "time": jnp.int32(0)}
-        return self._seen(state), state
-
-    def step_env(self, key, state, action, params):
-        cost = state["theta"] ** 2 + 0.1 * state["speed"] ** 2 + 0.001 * action**2
-        speed = state["speed"] + 0.05 * (15.0 * jnp.sin(state["theta"]) + 3.0 * action[0])
-        state = {"theta": state["theta"] + 0.05 * speed, "speed": speed, "time": state["time"] + 1}
-        done = state["time"] >= params.max_steps_in_episode
-        return self._seen(state), state, -cost, done, {"discount": 1.0}
-
-    def _seen(self, state):
-        return jnp.stack([jnp.cos(state["theta"]), jnp.sin(state["theta"]), state["speed"]])
-
-
-@pytest.mark.slow
-def test_the_docs_adapter_fits_gymnax():
-    page = (ROOT / "docs" / "any_environment.md").read_text()
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FromGymnax" in block)
-    names = {}
-    exec(compile(code, "docs/any_environment.md", "exec"), names)
-    env = adapt(names["FromGymnax"](GymnaxPendulum(), Params(max_steps_in_episode=5)), "pendulum")
-    states = play(env, [1.0] * 5)
-    assert [bool(s.truncated) for s in states] == [False] * 5 + [True] and not states[-1].terminated
-    # A full action is a torque of 2.
-    begun, after = states[0].inner, states[1].inner
-    assert after["speed"] - begun["speed"] == pytest.approx(0.05 * (15 * np.sin(begun["theta"]) + 6.0), rel=1e-4)
 
 
 def test_the_learner_needs_no_hand():

@@ -60,12 +60,6 @@ def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
             assert abs(far) < 0.5, "shuffled, and not alike in two epochs"
 
 
-@pytest.mark.parametrize("rows", [1, 7, 4096, 5000])
-def test_an_order_has_every_row_once(rows):
-    order = np.asarray(update.draw_order(jax.random.key(rows), 3, rows))
-    np.testing.assert_array_equal(np.sort(order, axis=1), np.tile(np.arange(rows), (3, 1)))
-
-
 def test_the_divergence_is_that_of_the_last_epoch(updates):
     """Each update lowers log_std by the learning rate (Adam under a constant gradient)."""
     first = (UPDATES.epochs - 1) * UPDATES.minibatches
@@ -215,22 +209,3 @@ def test_rewards_that_grow_are_followed():
     for _ in range(40):
         stats, rollout, counted = iterate(stats)
     assert float(counted) == 0 and float(rollout.reward.max()) == 250
-
-
-class Short(TinyEnv):
-    """Ends every episode after four steps."""
-
-    def step(self, state, action):
-        state = super().step(state, action)
-        return dataclasses.replace(state, truncated=state.metrics["length"] >= 4)
-
-    def randomize_episode_time(self, state, key):
-        return state
-
-
-def test_starts_that_are_used_again_are_counted():
-    """Eight steps from one reserve: two episodes end, and the second begins from a used start."""
-    for env, repeated in ((Short(), 1), (TinyEnv(), 0)):
-        training = make_train(env, SMALL)
-        _, metrics = training.step(training.init(jax.random.key(0)))
-        assert float(metrics["repeated_starts"][0]) == repeated * SMALL.num_envs

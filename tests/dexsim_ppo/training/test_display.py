@@ -78,12 +78,6 @@ def test_what_no_episode_has_told_keeps_its_last_value(shown):
     assert "rate" not in lines[-1] and "skipped updates 2 of 2360" in lines[-1]
 
 
-def test_numbers_are_short():
-    assert [display.count(x) for x in (0, 999, 1000, 12345, 1e6, 2.5e9)] == ["0", "999", "1k", "12.3k", "1M", "2.5G"]
-    seconds = (0, 59.4, 59.6, 75, 3600, -3, float("inf"), float("nan"))
-    assert [display.duration(s) for s in seconds] == ["0:00", "0:59", "1:00", "1:15", "60:00", "0:00", "-", "-"]
-
-
 def test_all_but_the_first_process_are_quiet(capsys):
     with display.Display("grasp on cpu, c", quiet=True) as view:
         view.working("compiling")

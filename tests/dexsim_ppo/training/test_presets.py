@@ -56,6 +56,19 @@ def test_default_settings_are_those_that_trained_the_tasks(name, task):
     assert preset.extremes == (0.6 if name == "gpu" else 0.0)
 
 
+def test_extremes_and_no_force_loop_are_for_training_alone():
+    """Evaluations and the policy's file have the task's own configuration."""
+    plain, _ = train.parse_arguments(["--task", "grasp", "--preset", "gpu"])
+    assert plain.extremes == 0.6 and plain.env == GraspConfig() and plain.env.control.force.gain > 0
+    trained = training_config(plain)
+    assert trained.randomization.extremes == trained.objects.extremes == 0.6 and trained.control.force.gain == 0
+    control = dataclasses.replace(trained.control, force=plain.env.control.force)
+    same = {"randomization": plain.env.randomization, "objects": plain.env.objects, "control": control}
+    assert dataclasses.replace(trained, **same) == plain.env
+    plain = preset_arguments("rotate", RotateConfig(), "cpu")
+    assert training_config(plain) is plain.env, "by which an evaluation knows that it may use the same environment"
+
+
 def test_an_iteration_by_the_defaults_of_a_cpu_moves_the_policy_by_about_the_target():
     """Of the tiny task: a learning rate far off would leave it, or throw it out of the region that it trusts."""
     ppo = dataclasses.replace(find_preset("cpu", "grasp").ppo, num_envs=64)
@@ -113,16 +126,3 @@ def test_a_policy_is_fine_tuned_with_little_noise_and_small_steps():
     assert found.learning_rate_max <= scratch.learning_rate_max and found.critic_first >= 50
     kept = ("num_envs", "rollout_length", "epochs", "minibatches", "discount", "gae_lambda", "clip_ratio")
     assert all(getattr(found, name) == getattr(scratch, name) for name in kept)
-
-
-def test_training_has_no_force_loop_and_the_policy_keeps_its_configuration():
-    config = GraspConfig()
-    force = dataclasses.replace(config.control.force, gain=0.5)
-    config = dataclasses.replace(config, control=dataclasses.replace(config.control, force=force))
-    arguments = dataclasses.replace(preset_arguments("grasp", config, "gpu"), extremes=0.0)
-    trained = training_config(arguments)
-    assert trained.control.force == dataclasses.replace(force, gain=0.0) and arguments.env == config
-    back = dataclasses.replace(trained.control, force=force)
-    assert dataclasses.replace(trained, control=back) == config, "nothing else changes"
-    plain = preset_arguments("rotate", RotateConfig(), "cpu")
-    assert training_config(plain) is plain.env, "by which an evaluation knows that it may use the same environment"

@@ -38,16 +38,6 @@ def row(iteration, **more):
     return {"iteration": iteration, "env_steps": steps, "seconds": 60.0 * iteration, "episode/return": iteration} | more
 
 
-def test_axes_have_words_and_units(figure):
-    rows = [row(i, **{"step/force_error": 1.0, "episode/success": 0.5, "step/own_error": 2.0}) for i in (1, 2, 3)]
-    axes = figure(rows).axes
-    words = [" ".join(axis.get_ylabel().split()) for axis in axes]
-    assert words == ["return of an episode", "success [share of episodes]", "force error [N]"]
-    assert axes[-1].get_xlabel() == "environment steps [million]"
-    assert not any("/" in word or "_" in word for word in words)
-    assert list(axes[0].lines[0].get_xdata()) == [0.5, 1.0, 1.5]
-
-
 def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
     axes = figure([row(1, **{"step/own_error": 2.0}), row(2, **{"evaluation/return": 7.0})]).axes
     assert axes[1].get_ylabel() == "own error\nof a tick"

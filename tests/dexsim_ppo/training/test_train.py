@@ -1,6 +1,5 @@
 """The two commands on the tiny task: what they write, how they resume, how they refuse."""
 
-import dataclasses
 import json
 import os
 import signal
@@ -9,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import jax
 import numpy as np
@@ -21,11 +19,9 @@ from tiny_train import PER_ITERATION
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.report import print_report, summarize
-from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
 
@@ -88,44 +84,6 @@ def test_evaluate_command(finished, tmp_path, capsys):
     assert "doing nothing" in shown and "error" in shown and "return" in shown and first["do_nothing"]["episodes"] == 16
 
 
-class Drops(TinyEnv):
-    """Terminates every episode at step 7."""
-
-    def step(self, state, action):
-        state = super().step(state, action)
-        return dataclasses.replace(state, terminated=state.metrics["length"] == 7)
-
-
-def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(finished):
-    params = load_policy(finished.best).params
-    _, film = evaluate.Evaluator(TinyEnv(), 4)(params, episodes=4, seed=0)
-    assert film["x"].shape == (2 * 32,)
-    _, film = evaluate.Evaluator(Drops(), 4)(params, episodes=4, seed=0)
-    assert film["x"].shape == (2 * (6 + 5),)
-
-
-@pytree_dataclass
-class Commanded:
-    """What a film of `Commands` holds."""
-
-    command: Any
-
-
-class Commands(TinyEnv):
-    """The target is what is commanded."""
-
-    def snapshot(self, state):
-        return Commanded(state.target)
-
-
-def test_film_shows_the_lowest_and_the_highest_command(finished):
-    env = Commands()
-    _, film = evaluate.Evaluator(env, 8)(load_policy(finished.best).params, episodes=8, seed=0)
-    starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
-    shown = np.asarray(film.command).reshape(2, -1)
-    np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
-
-
 def test_a_saved_configuration_begins_a_new_run(finished, tmp_path):
     """Its options are the defaults; what is typed beside it holds. Beside a policy it is fine-tuned: the steps of
     training from scratch would make it forget."""
@@ -175,19 +133,6 @@ def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
     shown = capsys.readouterr().out
     assert "doing nothing" in shown and f"{idle['task']['error']:.4g}" in shown
     assert "do_nothing" not in evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, baseline=False)
-
-
-def test_corners_are_for_training_alone():
-    from dexsim.tasks.rotate.config import RotateConfig
-
-    plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
-    assert plain.extremes == 0.6 and plain.env == RotateConfig()
-    asked = training_config(plain)
-    assert asked.randomization.extremes == asked.objects.extremes == 0.6
-    without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
-    assert without == plain.env
-    off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--extremes", "0"])
-    assert training_config(off) == RotateConfig()
 
 
 TRAIN_ERRORS = {

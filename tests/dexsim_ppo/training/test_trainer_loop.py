@@ -2,17 +2,14 @@
 
 import copy
 import dataclasses
-import json
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
-import tiny_train
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo import checkpoint, train
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder
@@ -128,35 +125,3 @@ def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monk
     else:
         assert not made and run.evaluator.env is env
     assert run.evaluator.chunk == 6
-
-
-QUICK = [*tiny_train.QUICK, *"--log-every 1 --evaluate-every 1 --evaluation-share 1".split()]
-
-
-def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tmp_path, monkeypatch):
-    tiny_train.install(monkeypatch)
-    folder = RunFolder(tmp_path / "a")
-    options = ["--checkpoint-every", "1", "--keep-checkpoints", "2", "--run-dir", str(folder.path)]
-    assert train.main([*QUICK, *options, "--steps", str(3 * 128)]) == 0
-    assert [path.name for path in folder.existing_checkpoints()] == ["00000002.msgpack", "00000003.msgpack"]
-    last = checkpoint.load(folder.latest_checkpoint(), kind="train")
-    progress = last.content["progress"]
-    rows = [json.loads(line) for line in folder.metrics.read_text().splitlines()]
-    best = max(rows, key=lambda row: row["evaluation/return"])
-    assert progress["best"] == {"return": best["evaluation/return"], "iteration": best["iteration"]}
-    assert progress["seconds"] >= rows[-1]["seconds"] > 0
-    # As if it had been better, and taken longer.
-    load, progress = checkpoint.load, {"best": {"return": 1e9, "iteration": 1}, "seconds": 5000.0, "without_better": 0}
-
-    def doctored(path, *, kind, **options):
-        file = load(path, kind=kind, **options)
-        return dataclasses.replace(file, content=file.content | {"progress": progress}) if kind == "train" else file
-
-    before = folder.best.read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "load", doctored)
-        assert train.main(["--resume", str(folder.path), "--steps", str(4 * 128)]) == 0
-    assert folder.best.read_bytes() == before
-    assert 5000 < json.loads(folder.metrics.read_text().splitlines()[-1])["seconds"] < 5600
-    progress = checkpoint.load(folder.latest_checkpoint(), kind="train").content["progress"]
-    assert progress["best"] == {"return": 1e9, "iteration": 1} and progress["seconds"] > 5000
