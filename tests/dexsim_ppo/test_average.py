@@ -37,19 +37,6 @@ def test_the_average_of_many_noisy_copies_comes_back_to_the_policy(name):
     assert np.linalg.norm(mean - wanted) < np.linalg.norm(one - wanted)
 
 
-def test_a_tree_of_two_is_halfway_and_a_file_holds_it(tmp_path):
-    one, other = (moved(load_policy("rotate_clear"), 0.1, seed) for seed in (1, 2))
-    files = [str(tmp_path / f"{k}.msgpack") for k in (1, 2)]
-    for policy, file in zip((one, other), files, strict=True):
-        policy.save(file)
-    assert main([*files, "--output", str(tmp_path / "made" / "average.msgpack")]) == 0
-    found = load_policy(tmp_path / "made" / "average.msgpack")
-    for a, b, mean in zip(*(jax.tree.leaves(p.params) for p in (one, other, found)), strict=True):
-        np.testing.assert_allclose(mean, a + (b - a) / 2, rtol=1e-5, atol=1e-7)
-    assert found.training == {"average_of": [{"seed": 1}, {"seed": 2}]}
-    assert found.env_config == one.env_config
-
-
 def test_what_has_no_common_origin_is_refused(tmp_path):
     clear, rotate = load_policy("rotate_clear"), load_policy("rotate")
     stranger = moved(clear, 20.0, 0)

@@ -1,7 +1,6 @@
 """The policies in assets/policies: load without a simulator, fit today's tasks, act, hold and turn."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,6 @@ from remembering import remembering
 
 import dexsim
 import dexsim_ppo
-from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
 from dexsim.core.errors import CheckpointError, ConfigError
@@ -21,7 +19,6 @@ from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
 from dexsim_ppo.policy import load_policy
-from dexsim_real.sensors.readings import sources_of
 
 SHIPPED = {
     "grasp": (GRASP, 66),
@@ -60,35 +57,6 @@ def test_one_call_acts_under_jit_vmap_and_scan(name):
     one, action = dexsim_ppo.act(policy.params, policy.initial_carry(), obs[0, 0])
     np.testing.assert_allclose(action, expected[0][0], atol=1e-5)
     assert jax.tree.structure(one) == jax.tree.structure(carry)
-
-
-@pytest.mark.parametrize(
-    ("name", "sources"),
-    [
-        ("grasp", {"hand", "camera", "user"}),
-        ("rotate", {"hand", "imu", "policy"}),
-        ("rotate_without_orientation", {"hand", "policy"}),
-    ],
-)
-def test_the_sensors_it_needs(name, sources):
-    assert sources_of([field.name for field in load_policy(name).observation_layout]) == sources
-
-
-def origins(training):
-    """The trainings that a policy comes from: several if it is an average."""
-    return training.get("average_of", [training])
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
-    report = json.loads(asset_path(f"policies/{name}.json").read_text())
-    policy = load_policy(name)
-    for told, origin in zip(origins(report["origin"]), origins(policy.training), strict=True):
-        assert told["env_steps"] == origin["env_steps"] and told["seed"] == origin["seed"]
-    for key in ("command", "hardware", "versions", "trained", "untrained"):
-        assert report[key]
-    # Else what the emulated hand draws outside the ranges would not be outside for it.
-    assert not report["arguments"]["env"]["randomization"].get("beyond") and "beyond" not in report["command"]
 
 
 def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():

@@ -77,20 +77,6 @@ def test_float64_is_an_error_before_anything_is_compiled():
         make_train(Reach(), SMALL)
 
 
-@pytest.mark.parametrize(
-    "name, message",
-    [
-        ("no_such_module:make", "cannot be imported"),
-        ("reach_env:nothing", "unknown task 'nothing'"),
-        ("reach_env:needs_a_size", "callable without arguments"),
-        ("reach_env:grasp", "dexsim has a task 'grasp' of its own"),
-    ],
-)
-def test_bad_names_are_one_line(name, message):
-    with pytest.raises(ConfigError, match=message):
-        train_policy(name, ppo=SMALL, steps=64)
-
-
 @pytest.mark.slow
 def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, capsys):
     config = dataclasses.replace(SMALL, num_envs=16)

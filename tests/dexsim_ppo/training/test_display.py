@@ -72,12 +72,6 @@ def test_without_a_budget_there_is_no_bar(shown):
     assert "elapsed 4:31" in lines[1] and not any("━" in line or "left" in line for line in lines)
 
 
-def test_what_no_episode_has_told_keeps_its_last_value(shown):
-    lines, _ = shown([ROW, ROW | {"episode/return": float("nan"), "kl": 0.5}], terminal=False)
-    assert "return 184.24" in lines[-1] and "KL 0.5000" in lines[-1]
-    assert "rate" not in lines[-1] and "skipped updates 2 of 2360" in lines[-1]
-
-
 def test_all_but_the_first_process_are_quiet(capsys):
     with display.Display("grasp on cpu, c", quiet=True) as view:
         view.working("compiling")

@@ -13,7 +13,6 @@ from tiny_train import PER_ITERATION
 from dexsim.core.errors import ConfigError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.policy import load_policy
-from dexsim_ppo.training import trainer
 from dexsim_ppo.training.runlog import RunFolder
 
 QUICK = [*tiny_train.QUICK, "--seed", "3"]
@@ -83,19 +82,6 @@ def test_an_older_checkpoint_is_resumed_for_good(finished):
     assert train.main(["--resume", str(first), "--steps", str(3 * PER_ITERATION), "--keep-checkpoints", "1"]) == 0
     assert finished.latest_checkpoint() == finished.checkpoint(3)
     assert (finished.checkpoints / "00000002.aside1.msgpack").read_bytes() == content
-
-
-def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
-    """The file of the one before it is gone; of those that follow one must be kept, though their returns are lower."""
-    returns = iter([5.0, 6.0, 3.0, 2.0])
-    monkeypatch.setattr(trainer, "headline", lambda report: {"return": {"value": next(returns)}})
-    often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
-    assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
-    folder = RunFolder(tmp_path / "a")
-    assert load_policy(folder.best).training["iteration"] == 2
-    assert train.main(["--resume", str(folder.checkpoint(1)), "--steps", str(3 * PER_ITERATION)]) == 0
-    assert (folder.path / "best.aside1.msgpack").exists() and load_policy(folder.best).training["iteration"] == 2
-    assert json.loads(folder.report.read_text())["policy"] == "best.msgpack"
 
 
 def contents(folder):
