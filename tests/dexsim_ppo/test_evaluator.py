@@ -98,7 +98,6 @@ def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_
     ("frames", "quality", "size", "rate"),
     [
         (200, "quick", (640, 480), 10.0),  # 20 s at 10 Hz: no more pictures than there are
-        (450, "quick", (640, 480), 400 / 45),
         (600, "quick", (640, 480), 8.0),  # 400 pictures would be 6.7 a second
         (600, "talk", (1920, 1080), 30.0),
     ],

@@ -90,7 +90,7 @@ def setting(seed, **options):
     params = jax.tree.map(jnp.add, params, change(0.4))
     single = lambda *x: RunningStats(jnp.int32(30), *(jnp.asarray(v, jnp.float32) for v in x))  # noqa: E731
     stats = {g: single(rng.normal(size=4), rng.uniform(0.2, 3, 4)) for g in Script.observation_layout}
-    return Script(rng), config, params, stats, single(0.7, 9.0), change(0.15)
+    return Script(rng), config, params, stats, single(0.7, 16.0), change(0.15)
 
 
 def experience(script, config, params, stats, value_stats, key):

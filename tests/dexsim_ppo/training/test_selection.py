@@ -1,5 +1,6 @@
 """Evaluations during training: when they happen, which policy they choose, and when they end a training."""
 
+import copy
 import dataclasses
 import time
 import types
@@ -77,3 +78,24 @@ def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
 def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
     nan = float("nan")
     assert evaluate(run, monkeypatch, nan, 3.0, nan, 2.0, 4.0) == [0, 1, 4]
+
+
+@pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
+def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monkeypatch):
+    """Not of training's corners; and Warp's buffers are of the batch's size."""
+    import dexsim
+
+    made = []
+    monkeypatch.setattr(dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv(), raising=False)
+    env = TinyEnv()
+    env.backend, env.hand = backend, "the hand"
+    arguments = dataclasses.replace(ARGUMENTS, evaluation_chunk=6)
+    if own and backend == "jax":
+        monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
+    run = Run(env, arguments, RunFolder(tmp_path), 0.0)
+    if own:
+        options = {"backend": backend, "num_envs": 6, "hand": "the hand"}
+        assert made == [(("tiny", arguments.env), options)] and run.evaluator.env is not env
+    else:
+        assert not made and run.evaluator.env is env
+    assert run.evaluator.chunk == 6

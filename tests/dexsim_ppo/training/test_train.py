@@ -25,7 +25,7 @@ from dexsim_ppo.report import print_report, summarize
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
 
-QUICK = [*tiny_train.QUICK, *"--evaluate-every 4 --evaluation-share 1 --log-every 1".split()]
+QUICK = [*tiny_train.QUICK, *"--evaluate-every 4 --evaluation-share 1 --log-every 2 --checkpoint-every 3".split()]
 
 
 @pytest.fixture(autouse=True)
@@ -43,9 +43,10 @@ def test_a_run_leaves_its_files(finished):
     files = (finished.config, finished.metrics, finished.best, finished.last, finished.untrained, finished.report)
     assert all(path.stat().st_size > 0 for path in (*files, finished.path / "curve.png"))
     rows = read_metrics(finished.metrics)
-    assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]
-    assert rows[-1]["env_steps"] == 6 * PER_ITERATION
-    assert rows[3]["evaluation/return"] is not None
+    assert [row["iteration"] for row in rows] == [1, 2, 4, 6], "the first, and every second"
+    assert rows[-1]["env_steps"] == 6 * PER_ITERATION and rows[-1]["seconds"] > rows[0]["seconds"] > 0
+    assert [row.get("evaluation/return") is not None for row in rows] == [False, False, True, False]
+    assert [path.name for path in finished.existing_checkpoints()] == ["00000003.msgpack", "00000006.msgpack"]
     config = json.loads(finished.config.read_text())
     assert config["arguments"]["ppo"]["num_envs"] == 16 and config["arguments"]["env"]["gain"] == 0.25
     report = json.loads(finished.report.read_text())
@@ -59,7 +60,7 @@ def test_a_run_leaves_its_files(finished):
     assert report["hardware"]["cpu_cores"] and report["versions"]["jax"] and "dexsim_ppo.train" in report["command"]
     policy, rows = load_policy(finished.best, task="tiny"), [row for row in rows if row.get("evaluation/return")]
     measured, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
-    assert measured["return"]["value"] == pytest.approx(max(row["evaluation/return"] for row in rows), rel=1e-5)
+    assert measured["return"]["value"] >= max(row["evaluation/return"] for row in rows) - 1e-4
 
 
 def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
@@ -68,7 +69,7 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
     assert train.main(["--resume", str(path), "--steps", str(6 * PER_ITERATION)]) == 0
     a, b = load_policy(finished.last), load_policy(RunFolder(path).last)
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
-    assert [r["iteration"] for r in read_metrics(RunFolder(path).metrics)] == [1, 2, 3, 4, 5, 6]
+    assert [r["iteration"] for r in read_metrics(RunFolder(path).metrics)] == [1, 2, 4, 6]
 
 
 def test_evaluate_command(finished, tmp_path, capsys):
