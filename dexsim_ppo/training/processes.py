@@ -7,11 +7,12 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
@@ -64,7 +65,8 @@ def agree_on_path(path: Path) -> Path:
 def save(path: Path, *, tree: TrainState, **content: Any) -> None:
     """`checkpoint.save` of the global state, written by the first process. All must call it."""
     if jax.process_count() > 1:  # A process can read what every device has, and no other process's environments.
-        tree = jax.jit(functools.partial(copied, mesh=tree.iteration.sharding.mesh))(tree)
+        mesh = cast(NamedSharding, tree.iteration.sharding).mesh
+        tree = jax.jit(functools.partial(copied, mesh=cast(Mesh, mesh)))(tree)
     if is_first():
         checkpoint.save(path, tree=tree, **content)
 

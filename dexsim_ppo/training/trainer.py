@@ -255,7 +255,7 @@ class Run:
     # --- files and reports --------------------------------------------------------------------------------
 
     def _policy(self, state: TrainState) -> Policy:
-        learner = jax.device_get(dataclasses.replace(state, env_state=None, carry=None, key=None))
+        learner = jax.device_get(dataclasses.replace(cast(Any, state), env_state=None, carry=None, key=None))
         return Policy.from_training(
             self.evaluator.env,
             self.config,

@@ -122,8 +122,8 @@ class Controller:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))
-        carry, action = self.policy.act(self.carry, observation)
-        action = np.clip(np.asarray(action), -1.0, 1.0)
+        carry, mode = self.policy.act(self.carry, observation)
+        action = np.clip(np.asarray(mode), -1.0, 1.0)
         if np.isfinite(action).all():
             self.carry = carry
             target = self.target = jax.device_get(self._move(self.target, action, measured.joint_position))
