@@ -14,7 +14,6 @@ from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.training.runlog import RunFolder
 
 DIVERGED_AFTER = 5  # calls in a row that skip more than half of their updates
-KEPT = 3  # reproducers of one run
 COUNTED = ("nonfinite_rewards", "bounded_rewards")
 
 # The step donates its state, so what a reproducer needs is copied before: one launch for all arrays.
@@ -45,7 +44,8 @@ class Faults:
         self._folder, self._task, self._save = folder, task, save
         self._skipped, self._totals = int(state.skipped_updates), dict.fromkeys(COUNTED, 0.0)
         self._clean_until, self._bad_calls = int(state.iteration), 0
-        self._clean, self._files = True, list[Path]()
+        self._clean = True
+        self._file: Path | None = None
 
     def check(
         self, before: TrainState, metrics: dict[str, np.ndarray], iteration: int, note: Callable[[str], None]
@@ -85,21 +85,20 @@ class Faults:
         }
 
     def _write(self, before: TrainState) -> str:
-        """Write a reproducer; how to replay it."""
-        if len(self._files) >= KEPT:
-            return ""
-        path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
-        try:
-            self._save(path, before)
-        except OSError as error:  # A full disk is no reason to stop.
-            return f"; {path} could not be written ({error.strerror})"
-        self._files.append(path)
+        """Write the first fault's reproducer; how to replay it."""
+        if self._file is None:
+            path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
+            try:
+                self._save(path, before)
+            except OSError as error:  # A full disk is no reason to stop.
+                return f"; {path} could not be written ({error.strerror})"
+            self._file = path
         return self._how_to_replay()
 
     def _how_to_replay(self) -> str:
-        if not self._files:
+        if self._file is None:
             return ""
-        return f"; replay: python -m dexsim_ppo.reproduce {self._files[-1]}{task_option(self._task)}"
+        return f"; replay: python -m dexsim_ppo.reproduce {self._file}{task_option(self._task)}"
 
     def _from_before(self) -> str:
         """Which checkpoints are from before the fault: later ones hold its state."""
