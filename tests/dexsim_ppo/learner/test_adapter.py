@@ -62,6 +62,15 @@ def test_the_time_limit_truncates_and_a_terminal_state_terminates():
     assert ended.terminated and not ended.truncated
 
 
+def test_restart_is_a_new_episode_where_asked():
+    env = adapt(Reach(), "reach")
+    state = play(env, [0.3, 0.3])[-1]
+    same, fresh = (jax.jit(env.restart)(state, jnp.bool_(done)) for done in (False, True))
+    assert same.inner["x"] == state.inner["x"] != fresh.inner["x"]
+    assert fresh.clock == 0 and fresh.metrics["length"] == 0 and same.clock == 2
+    assert jax.jit(env.restart)(same, jnp.bool_(True)).inner["x"] != fresh.inner["x"], "keys advance either way"
+
+
 def test_make_train_adapts_and_leaves_complete_environments_alone():
     training = make_train(Reach(), SMALL)
     state, metrics = training.step(training.init(jax.random.key(0)))
