@@ -256,7 +256,8 @@ def check_finite(params: PolicyParams, where: object) -> None:
 
 def _read(path: Path) -> Policy:
     file = checkpoint.load(path, kind="policy")
-    return _from_file(file.task, file.content, {name.strip("[']"): array for name, array in file.leaves.items()})
+    # The path of a dictionary's leaf is ['mean'].
+    return _from_file(file.task, file.content, {path.strip("[']"): array for path, array in file.leaves.items()})
 
 
 def _read_npz(path: Path) -> Policy:

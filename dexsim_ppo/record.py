@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         first, hand = trajectories[0], env.hand
         names = {"joint_position": hand.joint_names, "target": hand.joint_names}
         series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
-        for name in {field.name for field in dataclasses.fields(first)} - {"time", "taxel_force"}:
+        for name in (field.name for field in dataclasses.fields(first) if field.name not in ("time", "taxel_force")):
             values = getattr(first, name).reshape(len(first.time), -1)
             series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
         show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)
