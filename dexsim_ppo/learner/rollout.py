@@ -59,32 +59,38 @@ def collect_rollout(
         return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, carry)
 
     def step(now, key):
-        env_state, carry = now
+        env_state, carry, value_now = now
         obs = dict(env_state.obs)
         next_carry, mean = actor_step(config, params, normalizers, obs, carry)
         action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
         after = step_env(env_state, jnp.clip(action, -1.0, 1.0))
+        next_value = value(after.obs, next_carry)
         record = Rollout(
             obs=obs,
             decision=Decision(action, mean, distribution.log_prob(action, mean, params.log_std)),
-            value=value(obs, carry),
-            next_value=value(after.obs, next_carry),
+            value=value_now,
+            next_value=next_value,
             reward=after.reward,
             terminated=after.terminated,
             truncated=after.truncated,
             carry=carry,
         )
-        return (after, next_carry), after.terminated | after.truncated, (record, dict(after.metrics))
+        return (after, next_carry, next_value), after.terminated | after.truncated, (record, dict(after.metrics))
 
-    def restart(now, done):
-        env_state, carry = now
+    def begin(env_state, carry, done):
         return env.restart(env_state, done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), carry)
 
+    def restart(now, done):
+        env_state, carry = batched(begin, mesh)(*now[:2], done)
+        return env_state, carry, jnp.where(done, value(env_state.obs, carry), now[2])
+
+    # The value travels with the state: that of the next observation is the next step's, but where an episode begins.
+    first = state.env_state, state.carry, value(state.env_state.obs, state.carry)
     keys = jax.random.split(key, config.rollout_length)
-    last, (rollout, step_metrics) = scan_restarting(batched(restart, mesh), step, (state.env_state, state.carry), keys)
+    (*last, _), (rollout, step_metrics) = scan_restarting(restart, step, first, keys)
     finite = jnp.isfinite(rollout.reward)
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
-    return last, rollout, rollout_metrics(rollout, finite, step_metrics)
+    return tuple(last), rollout, rollout_metrics(rollout, finite, step_metrics)
 
 
 def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
