@@ -12,7 +12,6 @@ from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.render import render
 from dexsim_ppo import evaluate, load_policy
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
@@ -92,26 +91,6 @@ def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_
     env.control_period, env.evaluation_steps = 0.5, 130
     _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)
     assert film["x"].shape == (2 * 120,)
-
-
-@pytest.mark.parametrize(
-    ("frames", "quality", "size", "rate"),
-    [
-        (200, "quick", (640, 480), 10.0),  # 20 s at 10 Hz: no more pictures than there are
-        (600, "quick", (640, 480), 8.0),  # 400 pictures would be 6.7 a second
-        (600, "talk", (1920, 1080), 30.0),
-    ],
-)
-def test_a_video_has_enough_pictures_to_follow(frames, quality, size, rate, monkeypatch, tmp_path):
-    made = []
-    monkeypatch.setattr(render, "render_episode", lambda *a, **options: made.append((a, options)) or a[2])
-    film, env = {"x": np.zeros((frames, 3))}, TinyEnv()
-    assert evaluate.write_video(env, film, tmp_path / "a.mp4", quality) == tmp_path / "a.mp4"
-    ((_, shown, _, fps), options) = made[0]
-    assert shown is film and fps == pytest.approx(10.0)
-    assert options == {"size": size, "rate": pytest.approx(rate)}
-    with pytest.raises(ConfigError, match="'tiny' draws nothing"):
-        evaluate.write_video(env, {}, tmp_path / "a.mp4")
 
 
 def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_path, monkeypatch):

@@ -1,11 +1,10 @@
-"""Where metrics go, and that the learning curve says what it shows, in words and units."""
+"""Where metrics go, and which files of a run stay."""
 
 import json
 import sys
 import types
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import pytest
 from tiny_env import SMALL, TinyConfig
 
@@ -18,31 +17,6 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
-
-
-@pytest.fixture
-def figure(tmp_path, monkeypatch):
-    """The figure of rows of metrics."""
-    drawn = []
-    monkeypatch.setattr(plt, "close", drawn.append)
-
-    def draw(rows):
-        runlog.draw_curve([rows], tmp_path / "curve.png", "grasp")
-        return drawn[-1] if drawn else None
-
-    return draw
-
-
-def row(iteration, **more):
-    steps = 500_000 * iteration
-    return {"iteration": iteration, "env_steps": steps, "seconds": 60.0 * iteration, "episode/return": iteration} | more
-
-
-def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
-    axes = figure([row(1, **{"step/own_error": 2.0}), row(2, **{"evaluation/return": 7.0})]).axes
-    assert axes[1].get_ylabel() == "own error\nof a tick"
-    (mark,) = [line for line in axes[0].lines if line.get_label() == "evaluation"]
-    assert list(mark.get_ydata()) == [7.0]
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
