@@ -1,13 +1,11 @@
 """From an observation to an action: the pure functions of a policy, for use under `jit`, `vmap` and `scan`."""
 
-from typing import Literal
-
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass, static
-from dexsim_ppo.learner.distribution import squash
+from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.memory import GRU, carry_size, step_memory, zero_carry
 from dexsim_ppo.learner.networks import MLP, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
@@ -19,8 +17,6 @@ class PolicyParams:
 
     layers: MLP
     normalizer: Normalizer
-    squash: Literal["gaussian", "tanh"] = static(default="gaussian")
-    """`"gaussian"`: actions are clipped to [-1, 1]; `"tanh"`: squashed."""
     memory: GRU | None = None
 
 
@@ -43,14 +39,13 @@ def act(params: PolicyParams, carry: jax.Array | None, obs: jax.Array) -> tuple[
     Raises:
       ConfigError: the observation has another size, or the carry is not that of this policy and batch.
     """
-    size, shape = params.normalizer.mean.shape[0], np.shape(obs)
-    if shape[-1:] != (size,):
-        raise ConfigError(f"expected the actor's observation [..., {size}], state.obs['actor']; got the shape {shape}")
-    expected = None if params.memory is None else (*shape[:-1], carry_size(params.memory))
-    if (given := None if carry is None else np.shape(carry)) != expected:
+    size, shape = params.normalizer.mean.size, np.shape(obs)
+    carried = None if params.memory is None else (*shape[:-1], carry_size(params.memory))
+    given = None if carry is None else np.shape(carry)
+    if shape[-1:] != (size,) or given != carried:
         raise ConfigError(
-            f"expected a carry of the shape {expected} (None without memory), got {given}: begin an episode with "
-            "carry = policy.initial_carry(number of environments)"
+            f"expected an actor observation [..., {size}] and a carry of the shape {carried}, got {shape} and {given}: "
+            "begin an episode with carry = policy.initial_carry(number of environments)"
         )
     carry, features = step_memory(params.memory, carry, normalize(params.normalizer, obs))
-    return carry, squash(apply_mlp(params.layers, features), params.squash)
+    return carry, jnp.clip(apply_mlp(params.layers, features), -1.0, 1.0)

@@ -10,24 +10,21 @@ weight averaging").
 import dataclasses
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict, to_dict
-from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.core.config import from_dict
+from dexsim.core.errors import ConfigError
 from dexsim_ppo import checkpoint
+from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.memory import carry_size
-from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import make_normalizer, recover_stats
-from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.policy import Policy, check_finite, load_policy
 from dexsim_ppo.training.runlog import RunFolder
 
@@ -79,48 +76,34 @@ def policies_of(run: str | Path) -> dict[Path, Policy]:
     folder = RunFolder(Path(run))
     folder.latest_checkpoint()
     last = load_policy(folder.last)
-    if "ppo" not in last.training:
-        raise CheckpointError(f"{folder.last}: does not say how it was trained; name policies instead of the run")
-    config = from_dict(PPOConfig, last.training["ppo"])
-    return {path: _policy_at(path, last, config) for path in folder.existing_checkpoints()}
+    return {path: _policy_at(path, last) for path in folder.existing_checkpoints()}
 
 
-def _policy_at(path: Path, last: Policy, config: PPOConfig) -> Policy:
+def _policy_at(path: Path, last: Policy) -> Policy:
     """The policy of a checkpoint, in the form of its run's last one."""
-    params, std_floor = last.params, config.observation_std_floor
-    nothing: Any = None
-    like = TrainState(
-        params=Params(params.layers, nothing, nothing, params.memory),
-        observation_stats={"actor": recover_stats(params.normalizer, std_floor=std_floor)},
-        iteration=jnp.int32(0),
-        **dict.fromkeys(("adam", "learning_rate", "value_stats", "env_state", "key", "skipped_updates"), nothing),
-    )
-    state = checkpoint.restore(checkpoint.load(path, kind="train", task=last.task), like, part=True)
-    stats, clip = state.observation_stats["actor"], params.normalizer.clip
-    normalizer = make_normalizer(stats, last.observation_layout, std_floor=std_floor, clip=clip)
-    params = dataclasses.replace(params, layers=state.params.actor, normalizer=normalizer, memory=state.params.memory)
+    config, like = from_dict(PPOConfig, last.training["ppo"]), last.params
+    file = checkpoint.load(path, kind="train", task=last.task)
+    actor = checkpoint.restore(file, like.layers, ".params.actor")
+    memory = checkpoint.restore(file, like.memory, ".params.memory")
+    floor, clip = config.observation_std_floor, like.normalizer.clip
+    stats = recover_stats(like.normalizer, std_floor=floor)
+    stats = checkpoint.restore(file, stats, ".observation_stats['actor']")
+    normalizer = make_normalizer(stats, last.observation_layout, std_floor=floor, clip=clip)
+    params = PolicyParams(actor, normalizer, memory)
     check_finite(params, path)
-    iteration = int(state.iteration)
+    iteration = int(file.leaves[".iteration"])
     origin = {"iteration": iteration, "env_steps": iteration * config.steps_per_iteration}
     return dataclasses.replace(last, params=params, training=last.training | origin)
 
 
 def _form(policy: Policy) -> dict[str, Any]:
     """What averaged policies must have in common."""
-    return {
-        "task": policy.task,
-        "control": policy.spec and to_dict(policy.spec.control),
-        "control rate": policy.control_rate,
-        "hand": policy.hand,
-        "observation": policy.observation_layout,
-        "clip of the observation": policy.params.normalizer.clip,
-        "memory": carry_size(policy.params.memory),
-        "layers": [layer.kernel.shape for layer in policy.params.layers],
-        "distribution": policy.params.squash,
-    }
+    header = {name: value for name, value in policy.header().items() if name not in ("training", "env_config")}
+    network = {"network": [layer.kernel.shape for layer in policy.params.layers]}
+    return {"task": policy.task} | header | network | {"memory": carry_size(policy.params.memory)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class AverageArguments:
     """Options of `python -m dexsim_ppo.average`."""
 

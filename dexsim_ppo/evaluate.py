@@ -15,7 +15,6 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -26,13 +25,12 @@ import tyro
 
 from dexsim.core import cli
 from dexsim.core.compilation import jit
-from dexsim.core.config import override, setting, validate
+from dexsim.core.config import Config, override, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
 from dexsim_ppo.acting import PolicyParams, act, initial_carry
-from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.report import print_report, summarize, summarize_totals
@@ -46,8 +44,7 @@ class Evaluator:
       chunk: episodes run side by side.
     """
 
-    SHOWN = 2  # episodes that are filmed
-    SHOWN_SECONDS = 60.0
+    FILMED_S = 60.0
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
@@ -129,7 +126,7 @@ class Evaluator:
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
         """The shown episodes one after another, each to half a second after it terminated."""
-        after, longest = (round(s / self.env.control_period) for s in (0.5, self.SHOWN_SECONDS))
+        after, longest = (round(s / self.env.control_period) for s in (0.5, self.FILMED_S))
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
         ends = [min(end, longest) for end in ends]
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
@@ -157,18 +154,6 @@ def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "qu
     # At fewer than eight pictures a second a gait cannot be followed.
     size, rate = ((1920, 1080), 30.0) if quality == "talk" else ((640, 480), min(max(400 / seconds, 8.0), fps))
     return Path(render_episode(env, snapshots, path, fps, size=size, rate=rate))
-
-
-def default_chunk() -> int:
-    """Episodes run side by side on the device found."""
-    return 1024 if jax.default_backend() == "gpu" else 64
-
-
-def default_episodes(env: Environment) -> int:
-    """Episodes of an evaluation on the device found: 1024 on a GPU, on a CPU what about a minute suffices for."""
-    if jax.default_backend() == "gpu":
-        return 1024
-    return 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
 
 
 def evaluate_policy(
@@ -199,22 +184,19 @@ def evaluate_policy(
     Raises:
       CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
-    EvaluateArguments(policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk)
+    arguments = EvaluateArguments(
+        policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk, baseline=baseline
+    )
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
-    chunk = min(chunk or default_chunk(), episodes or default_chunk())
     if env is None:
         env = policy.make_env(backend=backend)
     else:
         policy.check_env(env)
-    evaluator, episodes = Evaluator(env, chunk), episodes or default_episodes(env)
-    report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
-    if baseline:
-        report["do_nothing"], _ = evaluator(policy.params, episodes=episodes, seed=seed, idle=True)
-    return report | {"backend": env.backend}
+    return _measure(policy, env, arguments)[0]
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateArguments:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateArguments(Config):
     """Options of `python -m dexsim_ppo.evaluate`."""
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -248,8 +230,28 @@ class EvaluateArguments:
     video_quality: Literal["quick", "talk"] = setting("quick")
     """quick: 640 x 480 and few frames. talk: 1920 x 1080 at 30 frames a second, which takes minutes."""
 
-    def __post_init__(self) -> None:
-        validate(self)
+
+def chunk_of(arguments: EvaluateArguments) -> int:
+    """Episodes that run side by side, by default those that suit the device."""
+    default = 1024 if jax.default_backend() == "gpu" else 64
+    return min(arguments.chunk or default, arguments.episodes or default)
+
+
+def default_episodes(env: Environment) -> int:
+    """Episodes of an evaluation on the device found: 1024 on a GPU, on a CPU what about a minute suffices for."""
+    if jax.default_backend() == "gpu":
+        return 1024
+    return 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
+
+
+def _measure(policy: Policy, env: Environment, arguments: EvaluateArguments, label: str = "") -> tuple[dict, Any]:
+    """The report, with that of a hand that does nothing, and the film."""
+    evaluator, episodes = Evaluator(env, chunk_of(arguments)), arguments.episodes or default_episodes(env)
+    measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
+    report, film = measure(label=label)
+    if arguments.baseline:
+        report["do_nothing"], _ = measure(idle=True, label=label and "doing nothing")
+    return report | {"backend": env.backend}, film
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -265,26 +267,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in (arguments.output, video):
         if path:
             cli.check_writable(path)
-    if video and video.suffix not in (".mp4", ".gif"):
-        raise ConfigError(f"--video {video}: give a file that ends in .mp4 or .gif")
     cli.check_apart({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
-    chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
     with cli.naming_options(entry.config_class, entry.config()):
         env = policy.make_env(backend=arguments.backend, hand=hand)
-    if video and isinstance(env, Adapted):
-        raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
-    evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)
-    measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
-    report, snapshots = measure(label=arguments.policy)
-    if arguments.baseline:
-        report["do_nothing"], _ = measure(idle=True, label="doing nothing")
+    report, snapshots = _measure(policy, env, arguments, label=arguments.policy)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
-    report |= {"hand": arguments.hand} if arguments.hand else {}
-    report |= {"backend": env.backend} | cli.environment_report()
+    report |= {"hand": arguments.hand or None} | cli.environment_report()
     # First the table: a full disk must not cost what was measured.
     print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")
     if arguments.output:

@@ -9,76 +9,53 @@ rate.
 """
 
 import dataclasses
-import itertools
 import warnings
-from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
+import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.assets import asset_path
-from dexsim.core.config import flat, from_dict, setting, to_dict, validate
+from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.layout import LayoutEntry, layout_size
 from dexsim.core.pytree import Array
-from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
+from dexsim.hand.source import record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.memory import GRU, carry_size
+from dexsim_ppo.learner.memory import GRU
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer
 from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.portable import PortablePolicy
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
     from dexsim.hand.kinematics import Hand
 
+_GRU = ("input_kernel", "input_bias", "recurrent_kernel", "recurrent_bias")
 _act = jax.jit(act)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicyHeader:
-    """What the file of a policy says beside its numbers, in every format."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyHeader(Config):
+    """What the file of a policy says beside its numbers, in every format; see `Policy`."""
 
     env_config: dict[str, Any]
-    """Configuration of the environment that it was trained in."""
-    control_rate: float = setting(MISSING, unit="Hz", low=1.0, high=1000.0)
-    """Actions per second."""
+    control_rate: float = setting(dataclasses.MISSING, unit="Hz", low=1.0, high=1000.0)
     observation_layout: tuple[tuple[str, int, float | None], ...]
-    """Name, size and scale of each entry of the observation."""
-    squash: Literal["gaussian", "tanh"]
-    """See `PolicyParams`."""
-    clip: float = setting(MISSING, unit="1", low=0.1, high=1e4)
-    """Bound on normalised observations."""
-    layers: int = setting(MISSING, unit="1", low=1, high=64)
-    """Layers of the actor's network."""
-    memory: tuple[str, int] | None
-    """Kind and units of the memory."""
+    clip: float = setting(dataclasses.MISSING, unit="1", low=0.1, high=1e4)
     training: dict[str, Any]
-    """Where it comes from."""
     spec: TaskSpec | None
-    """What a host must know of the task."""
     hand: dict[str, Any] | None
-    """Which hand it was trained on."""
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if self.hand is not None:
-            check_record(self.hand)
-
-    @property
-    def layout(self) -> tuple[LayoutEntry, ...]:
-        """The observation's layout."""
-        return tuple(LayoutEntry(*entry) for entry in self.observation_layout)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Policy:
     """A deterministic policy and what one must know to use it."""
 
@@ -131,26 +108,31 @@ class Policy:
         params = dataclasses.replace(self.params, layers=(first, *others), memory=memory)
         return dataclasses.replace(self, params=params)
 
-    @property
-    def header(self) -> PolicyHeader:
-        """What its file says beside the numbers."""
-        units = carry_size(self.params.memory)
-        return PolicyHeader(
-            env_config=self.env_config,
-            control_rate=self.control_rate,
-            observation_layout=tuple((entry.name, entry.size, entry.scale) for entry in self.observation_layout),
-            squash=self.params.squash,
-            clip=self.params.normalizer.clip,
-            layers=len(self.params.layers),
-            memory=("gru", units) if units else None,
-            training=self.training,
-            spec=self.spec,
-            hand=self.hand,
-        )
+    def header(self) -> dict[str, Any]:
+        """What its file says beside the numbers: a `PolicyHeader` as plain data."""
+        return {
+            "env_config": self.env_config,
+            "control_rate": self.control_rate,
+            "observation_layout": [list(entry) for entry in self.observation_layout],
+            "clip": self.params.normalizer.clip,
+            "training": self.training,
+            "spec": self.spec and to_dict(self.spec),
+            "hand": self.hand,
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The numbers of its file by name; see `dexsim_ppo.portable`."""
+        params = self.params
+        arrays = {"mean": params.normalizer.mean, "std": params.normalizer.std}
+        for i, layer in enumerate(params.layers):
+            arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
+        if params.memory is not None:
+            arrays |= dict(zip(_GRU, jax.tree.leaves(params.memory), strict=True))
+        return {name: np.asarray(array) for name, array in arrays.items()}
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
-        checkpoint.save(path, kind="policy", task=self.task, content=to_dict(self.header), tree=self.params)
+        checkpoint.save(path, kind="policy", task=self.task, content=self.header(), tree=self.arrays())
 
     def find_hand(self, given: str | Path | None = None) -> "Hand | None":
         """The hand that the policy was trained on, or the file that is `given`; None for the default one.
@@ -160,10 +142,6 @@ class Policy:
             taxels.
         """
         return recorded_hand(self.hand, given, f"the policy of {self.task!r}")
-
-    def check_hand(self, hand: "Hand") -> None:
-        """Raises ConfigError: the policy was trained on another hand than this one."""
-        check_same(self.hand, hand, f"the policy of {self.task!r}")
 
     def make_env(self, *, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
         """The environment that the policy was trained in; arguments as in `dexsim.make`.
@@ -180,22 +158,27 @@ class Policy:
         self.check_env(env)
         return cast(Any, env)
 
-    def check_env(self, env: Environment) -> None:
-        """Whether an environment is the one that the policy was trained in.
-
-        Warns (`OtherEnvWarning`) of settings that differ.
+    def check_fit(self, env: Environment) -> None:
+        """Whether the policy can act in an environment.
 
         Raises:
-          CheckpointError: the environment's observation has another layout than the policy's, or it takes other
-            actions.
+          CheckpointError: it observes something else, or takes other actions.
         """
-        given, actions = tuple(env.observation_layout["actor"]), self.params.layers[-1].bias.size
-        if given != self.observation_layout:
-            raise CheckpointError(
-                f"{env.name} observes {layout_text(given)}; the policy expects {layout_text(self.observation_layout)}"
-            )
-        if actions != env.action_size:
+        layouts = tuple(env.observation_layout["actor"]), self.observation_layout
+        if layouts[0] != layouts[1]:
+            given, expected = (", ".join(f"{entry.name} [{entry.size}]" for entry in layout) for layout in layouts)
+            raise CheckpointError(f"{env.name} observes {given}; the policy expects {expected}")
+        if (actions := self.params.layers[-1].bias.size) != env.action_size:
             raise CheckpointError(f"{env.name} takes {env.action_size} actions; the policy gives {actions}")
+
+    def check_env(self, env: Environment) -> None:
+        """Whether an environment is the one that the policy was trained in; warns (`OtherEnvWarning`) of settings that
+        differ.
+
+        Raises:
+          CheckpointError: the policy cannot act in it; see `check_fit`.
+        """
+        self.check_fit(env)
         today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
         trained, now = flat(to_dict(today)), flat(to_dict(env.config))
         changed = [
@@ -204,11 +187,8 @@ class Policy:
             if trained.get(path) != now.get(path)
         ]
         if changed:
-            warnings.warn(
-                f"not the environment that the policy was trained in: {', '.join(changed)}",
-                OtherEnvWarning,
-                stacklevel=2,
-            )
+            text = f"not the environment that the policy was trained in: {', '.join(changed)}"
+            warnings.warn(text, OtherEnvWarning, stacklevel=2)
 
     @classmethod
     def from_training(
@@ -222,13 +202,9 @@ class Policy:
           training: what to remember of its origin.
         """
         layout = tuple(env.observation_layout["actor"])
-        normalizer = make_normalizer(
-            state.observation_stats["actor"],
-            layout,
-            std_floor=config.observation_std_floor,
-            clip=config.observation_clip,
-        )
-        params = PolicyParams(state.params.actor, normalizer, config.distribution, state.params.memory)
+        floor, clip = config.observation_std_floor, config.observation_clip
+        normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)
+        params = PolicyParams(state.params.actor, normalizer, state.params.memory)
         return cls(
             task=env.name,
             env_config=to_dict(env.config),
@@ -245,37 +221,31 @@ def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
     """A policy from a file, or a shipped one by its name.
 
     Args:
-      name: path of a file, or the name of a shipped policy.
+      name: path of a file, also of one that `python -m dexsim_ppo.export` wrote for NumPy (.npz), or the name of a
+        shipped policy.
       task: the policy's task, or another name that it is registered under; with its module (`my_module:poke`) where
         that has to be imported. None takes any.
 
     Raises:
       CheckpointError: there is no such policy, it is of another task, or its file is unsound.
     """
-    file = checkpoint.load(_find(name), kind="policy")
+    path = _find(name)
     try:
-        header = from_dict(PolicyHeader, file.content)
-        params = checkpoint.restore(file, _expected_params(header, file.leaves))
-    except (ConfigError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{file.path}: invalid policy: {error}") from None
-    check_finite(params, file.path)
+        policy = _read_npz(path) if path.suffix == ".npz" else _read(path)
+        jax.eval_shape(act, policy.params, policy.initial_carry(), np.zeros(layout_size(policy.observation_layout)))
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (ConfigError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path}: invalid policy: {' '.join(str(error).split()):.300}") from None
+    check_finite(policy.params, path)
     if task:
         from dexsim.registry import find_task
 
         # One task may be registered under several names; the file has one of them.
         entry, word = find_task(task), task.rpartition(":")[2]
-        if file.task != word and (entry.environment or find_task(file.task).task is not entry.task):
-            raise CheckpointError(f"{name}: is of the task {file.task!r}, not {word!r}")
-    return Policy(
-        task=file.task,
-        env_config=header.env_config,
-        observation_layout=header.layout,
-        params=jax.tree.map(jnp.asarray, params),
-        control_rate=header.control_rate,
-        training=header.training,
-        spec=header.spec,
-        hand=header.hand,
-    )
+        if policy.task != word and (entry.environment or find_task(policy.task).task is not entry.task):
+            raise CheckpointError(f"{name}: is of the task {policy.task!r}, not {word!r}")
+    return policy
 
 
 def check_finite(params: PolicyParams, where: object) -> None:
@@ -284,9 +254,38 @@ def check_finite(params: PolicyParams, where: object) -> None:
         raise CheckpointError(f"{where}: holds numbers that are not finite, or deviations that are not positive")
 
 
-def layout_text(layout: Sequence[LayoutEntry]) -> str:
-    """A layout in an error message: names with sizes."""
-    return ", ".join(f"{entry.name} [{entry.size}]" for entry in layout)
+def _read(path: Path) -> Policy:
+    file = checkpoint.load(path, kind="policy")
+    # The path of a dictionary's leaf is ['mean'].
+    return _from_file(file.task, file.content, {path.strip("[']"): array for path, array in file.leaves.items()})
+
+
+def _read_npz(path: Path) -> Policy:
+    file = PortablePolicy.load(path)
+    header = {name: value for name, value in file.header.items() if name not in ("format", "task")}
+    return _from_file(file.task, header, file.arrays)
+
+
+def _from_file(task: str, data: dict[str, Any], arrays: dict[str, np.ndarray]) -> Policy:
+    """The policy that a header and arrays by name stand for."""
+    header = from_dict(PolicyHeader, data)
+    layer = lambda kernel, bias: Layer(jnp.asarray(arrays[kernel]), jnp.asarray(arrays[bias]))  # noqa: E731
+    count = sum(name.startswith("kernel_") for name in arrays)
+    normalizer = Normalizer(jnp.asarray(arrays["mean"]), jnp.asarray(arrays["std"]), header.clip)
+    return Policy(
+        task=task,
+        env_config=header.env_config,
+        observation_layout=tuple(LayoutEntry(*entry) for entry in header.observation_layout),
+        params=PolicyParams(
+            tuple(layer(f"kernel_{i}", f"bias_{i}") for i in range(count)),
+            normalizer,
+            GRU(layer(*_GRU[:2]), layer(*_GRU[2:])) if _GRU[0] in arrays else None,
+        ),
+        control_rate=header.control_rate,
+        training=header.training,
+        spec=header.spec,
+        hand=header.hand,
+    )
 
 
 def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
@@ -296,20 +295,10 @@ def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
     return dataclasses.replace(layer, kernel=layer.kernel * mask[:, None])
 
 
-def _expected_params(header: PolicyHeader, leaves: dict[str, Any]) -> PolicyParams:
-    """Shapes of the parameters, from the header and the widths of the layers."""
-    f32: Any = lambda *shape: jax.ShapeDtypeStruct(shape, np.float32)  # noqa: E731
-    size, units = layout_size(header.layout), header.memory[1] if header.memory else 0
-    widths = [size + units, *(leaves[f".layers[{i}].bias"].size for i in range(header.layers))]
-    layers = tuple(Layer(f32(n, m), f32(m)) for n, m in itertools.pairwise(widths))
-    memory = GRU(*(Layer(f32(n, 3 * units), f32(3 * units)) for n in (size, units))) if units else None
-    return PolicyParams(layers, Normalizer(f32(size), f32(size), header.clip), header.squash, memory)
-
-
 def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
     path, text = Path(name), str(name)
-    if path.is_file() or "/" in text or text.endswith(".msgpack"):
+    if path.is_file() or "/" in text or path.suffix in (".msgpack", ".npz"):
         return path
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))

@@ -6,10 +6,9 @@
 
 This module imports only NumPy and may be copied to a computer that has nothing else.
 
-The file is a NumPy archive without pickles: `header` (JSON: task, control rate, observation layout, squashing, clip),
-`mean` and `std` [n] of the observation, and `kernel_0` [in, out], `bias_0` [out] and so on for every layer. A gated
-recurrent unit has `input_kernel`, `input_bias`, `recurrent_kernel` and `recurrent_bias`: reset gate, update gate,
-candidate.
+The file is a NumPy archive without pickles: `header` (JSON: task, control rate, observation layout, clip), `mean` and
+`std` [n] of the observation, and `kernel_0` [in, out], `bias_0` [out] and so on for every layer. A gated recurrent unit
+has `input_kernel`, `input_bias`, `recurrent_kernel` and `recurrent_bias`: reset gate, update gate, candidate.
 """
 
 import json
@@ -18,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = "dexsim policy 2"
+FORMAT = "dexsim policy 3"
 
 
 class PortablePolicy:
@@ -30,13 +29,14 @@ class PortablePolicy:
     """
 
     def __init__(self, header: dict[str, Any], arrays: dict[str, np.ndarray]):
-        self.header, self._arrays = header, arrays
+        self.header, self.arrays = header, arrays
         self.task: str = header["task"]
         self.control_rate: float = header["control_rate"]
         """Actions per second, Hz."""
         self.observation_layout: list[list[Any]] = header["observation_layout"]
         """Name, size and scale of each field of the observation, in order."""
-        self._carry_size = header["memory"][1] if header["memory"] else 0
+        self._layers = sum(name.startswith("kernel_") for name in arrays)
+        self._carry_size = len(arrays["recurrent_kernel"]) if "recurrent_kernel" in arrays else 0
 
     @classmethod
     def load(cls, path: str | Path) -> "PortablePolicy":
@@ -50,7 +50,7 @@ class PortablePolicy:
             arrays = dict(file)
         header = json.loads(str(arrays.pop("header")))
         if header["format"] != FORMAT:
-            raise ValueError(f"{path}: expected the format {FORMAT!r}, got {header['format']!r}")
+            raise ValueError(f"expected the format {FORMAT!r}, got {header['format']!r}")
         return cls(header, arrays)
 
     def initial_carry(self, *batch: int) -> np.ndarray | None:
@@ -58,32 +58,21 @@ class PortablePolicy:
         return np.zeros((*batch, self._carry_size), np.float32) if self._carry_size else None
 
     def act(self, carry: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-        """The next carry [..., m], and the action [..., A] in [-1, 1] for an observation [..., n] in SI units.
-
-        Raises:
-          ValueError: the observation has another size, or the carry is not that of this policy and batch.
-        """
-        arrays, clip = self._arrays, self.header["clip"]
-        size, shape = arrays["mean"].size, np.shape(observation)
-        if shape[-1:] != (size,):
-            raise ValueError(f"expected an observation [..., {size}], got the shape {shape}")
-        expected = (*shape[:-1], self._carry_size) if self._carry_size else None
-        if (given := None if carry is None else np.shape(carry)) != expected:
-            raise ValueError(f"expected a carry of the shape {expected}, got {given}: begin with initial_carry()")
+        """The next carry [..., m], and the action [..., A] in [-1, 1] for an observation [..., n] in SI units."""
+        arrays, clip = self.arrays, self.header["clip"]
         x = np.clip((np.asarray(observation, np.float32) - arrays["mean"]) / arrays["std"], -clip, clip)
-        if carry is not None:
+        if self._carry_size:
             carry = self._step_memory(np.asarray(carry), x)
             x = np.concatenate([x, carry], -1)
-        last = self.header["layers"] - 1
-        for i in range(last + 1):
+        for i in range(self._layers):
             x = x @ arrays[f"kernel_{i}"] + arrays[f"bias_{i}"]
-            if i < last:
+            if i < self._layers - 1:
                 x = np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))  # ELU
-        return carry, np.tanh(x) if self.header["squash"] == "tanh" else np.clip(x, -1.0, 1.0)
+        return carry, np.clip(x, -1.0, 1.0)
 
     def _step_memory(self, carry: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The carry after the normalised observation `x`."""
-        arrays = self._arrays
+        arrays = self.arrays
         now = np.split(x @ arrays["input_kernel"] + arrays["input_bias"], 3, -1)
         past = np.split(carry @ arrays["recurrent_kernel"] + arrays["recurrent_bias"], 3, -1)
         # The logistic function by tanh, which does not overflow.

@@ -10,7 +10,6 @@ writes the same formats from such a log.
 import dataclasses
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,13 +19,12 @@ import tyro
 
 from dexsim.core import cli
 from dexsim.core.compilation import jit
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
-from dexsim.registry import find_task
 from dexsim_ppo.acting import act
 from dexsim_ppo.policy import Policy, load_policy
 
@@ -58,8 +56,8 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
     return trajectories
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordArguments:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordArguments(Config):
     """Options of `python -m dexsim_ppo.record`."""
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -76,9 +74,6 @@ class RecordArguments:
     """Seed of the episodes."""
     task: str = ""
     """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
-
-    def __post_init__(self) -> None:
-        validate(self)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -99,27 +94,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_rerun()
         cli.check_writable(arguments.rrd)
     cli.enable_caches()
-    if find_task(policy.task).environment:
-        raise ConfigError(f"{arguments.policy}: {policy.task!r} is no task on a hand: there is nothing to record")
     env = policy.make_env()
     trajectories = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
     if arguments.lerobot:
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
-        first = trajectories[0]
-        names = {"joint_position": env.hand.joint_names, "target": env.hand.joint_names}
-        series = {
-            field.name: (
-                names.get(field.name, tuple(f"{field.name} {i}" for i in range(values.shape[1]))),
-                values,
-            )
-            for field in dataclasses.fields(first)
-            if field.name not in ("time", "taxel_force")
-            for values in [getattr(first, field.name).reshape(len(first.time), -1)]
-        }
-        series["force"] = env.hand.finger_names, first.taxel_force.sum(-1)
-        show_rerun(env.hand, first.time, series, first.taxel_force, arguments.rrd)
+        first, hand = trajectories[0], env.hand
+        names = {"joint_position": hand.joint_names, "target": hand.joint_names}
+        series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
+        for name in (field.name for field in dataclasses.fields(first) if field.name not in ("time", "taxel_force")):
+            values = getattr(first, name).reshape(len(first.time), -1)
+            series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
+        show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
     return 0
 

@@ -1,18 +1,13 @@
 """What an evaluation reports: figures with intervals by start state, and the table that is printed of them."""
 
-import json
 from typing import Any
 
 import numpy as np
 
-from dexsim.core import cli, statistics
-from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner.types import Evaluated
+from dexsim.core import statistics
 
 
-def summarize(
-    env: Evaluated, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
-) -> dict[str, Any]:
+def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray) -> dict[str, Any]:
     """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
 
     An episode lives up to, and not including, its first terminated step. That step's reward belongs to
@@ -30,45 +25,30 @@ def summarize(
         "episodes": episodes,
         "steps": steps,
         **_intervals(alive[-1], returns, steps_held, start),
-        "task": _own(env, masked, alive),
+        "task": env.summarize(masked, alive),
     }
 
 
-def summarize_totals(
-    env: Evaluated, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
-) -> dict[str, Any]:
+def summarize_totals(env: Any, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
     """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
     held = lived == env.evaluation_steps
     return {
         "episodes": int(lived.size),
         "steps": env.evaluation_steps,
         **_intervals(held, metrics["return"], lived, start),
-        "task": _own(env, metrics, lived),
+        "task": env.summarize(metrics, lived),
     }
-
-
-def _own(env: Evaluated, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
-    """What the task makes of its metrics.
-
-    Raises:
-      ConfigError: it is not plain data.
-    """
-    report: Any = env.summarize(metrics, alive)
-    try:
-        json.dumps(cli.plain(report))
-    except TypeError as error:
-        raise ConfigError(f"task {env.name!r}: summarize must return plain data ({error})") from None
-    return report
 
 
 def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
     """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
-    starts = len(np.unique(start))
-    share = proportion(held) if starts == held.size else mean_interval(held.astype(float), start)
-    share |= {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)}
+    starts, share = len(np.unique(start)), mean_interval(held, start)
+    if starts == held.size:
+        wilson = statistics.proportion(held)
+        share = {"value": wilson["mean"], "low": wilson["low"], "high": wilson["high"]}
     return {
         "starts": starts,
-        "held": share,
+        "held": share | {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)},
         "return": mean_interval(returns, start),
         "steps_held": mean_interval(lived, start),
     }
@@ -84,24 +64,19 @@ def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
     return {"value": mean, "low": mean - half, "high": mean + half}
 
 
-def proportion(x: np.ndarray) -> dict[str, float]:
-    """Share of true samples with its Wilson 95 % interval."""
-    share = statistics.proportion(x)
-    return {"value": share["mean"], "low": share["low"], "high": share["high"]}
-
-
 def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
     """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
     from rich.console import Console
     from rich.table import Table
 
     idle = do_nothing and headline(do_nothing)
+    number = lambda value: "-" if value is None else f"{value:.4g}"  # noqa: E731
     table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
     for name, entry in headline(report).items():
         low, high = entry.get("low"), entry.get("high")
         span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
-        beside = [_number(idle.get(name, {}).get("value"))] if idle else []
-        table.add_row(name, _number(entry["value"]), span, *beside)
+        beside = [number(idle.get(name, {}).get("value"))] if idle else []
+        table.add_row(name, number(entry["value"]), span, *beside)
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
 
@@ -111,10 +86,6 @@ def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
     own = report["task"].get("headline") or {"held": report["held"]}
     rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in own.items()}
     return rows | {"return": report["return"]}
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def significantly_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:

@@ -2,15 +2,14 @@
 
     python -m dexsim_ppo.reproduce runs/grasp-20260101-120000/reproduce-00000420.msgpack
 
-Training writes the file: the task, its configuration, the seed and the whole state before that iteration.
+Training writes the file: a checkpoint from before that iteration.
 """
 
 import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -18,18 +17,17 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import naming_file
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, collect_rollout, make_train
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.train import make_environment
-from dexsim_ppo.training.arguments import arguments_from_dict, find_hand
+from dexsim_ppo.train import default_arguments, make_environment
+from dexsim_ppo.training.arguments import find_hand
 from dexsim_ppo.training.faults import keep
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ReproduceArguments:
     """Options of `python -m dexsim_ppo.reproduce`."""
 
@@ -50,11 +48,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     if arguments.task:
         find_task(arguments.task)
-    file = checkpoint.load(arguments.file, kind="reproducer")
-    env, config, state, step, calls = _prepare(file)
-    for _ in range(calls):
+    file = checkpoint.load(arguments.file, kind="train")
+    saved = default_arguments(None, "auto", file)
+    env, config = make_environment(saved, find_hand(saved, file), 1), saved.ppo
+    training = make_train(env, dataclasses.replace(config, iterations_per_call=1), saved.curriculum)
+    restored = checkpoint.restore(file, training.shapes(jax.random.key(saved.seed)))
+    state: TrainState = jax.tree.map(jnp.copy, restored)
+    print(f"{file.path}: {file.task}, seed {saved.seed}, {config.num_envs} environments, {env.backend} physics")
+    for _ in range(config.iterations_per_call):
         before = keep(state)
-        state, _ = step(state)
+        state, _ = training.step(state)
         iteration, lost = int(before.iteration), int(state.skipped_updates) - int(before.skipped_updates)
         if lost:
             print(f"iteration {iteration}: {lost} of {config.epochs * config.minibatches} gradients are not finite")
@@ -64,21 +67,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"iteration {iteration}: every gradient is finite")
     print(f"not reproduced ({env.backend} on {jax.devices()[0].device_kind})")
     return 1
-
-
-def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, TrainState, Any, int]:
-    """Environment, learner's settings, state, step of one iteration, and how many to replay."""
-    entry = find_task(file.task)
-    with naming_file(file.path):
-        saved = arguments_from_dict(entry.config_class, file.content["arguments"])
-    config = dataclasses.replace(saved.ppo, iterations_per_call=1)
-    if (backend := file.content["backend"]) != "own":
-        saved = dataclasses.replace(saved, backend=backend)
-    env = make_environment(saved, find_hand(saved, file))
-    training = make_train(env, config, saved.curriculum)
-    state = checkpoint.restore(file, training.shapes(jax.random.key(saved.seed)))
-    print(f"{file.path}: {file.task}, seed {saved.seed}, {config.num_envs} environments, {env.backend} physics")
-    return env, config, jax.tree.map(jnp.copy, state), training.step, file.content["calls"]
 
 
 def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator[str]:
@@ -93,9 +81,10 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
             steps, rows = np.nonzero(bad[..., start : start + field.size].any(-1))
             start += field.size
             if steps.size:
-                some = ", ".join(map(str, sorted(set(rows.tolist()))[:8]))
+                numbers = np.unique(rows)
+                some = ", ".join(map(str, numbers[:8]))
                 yield (
-                    f"{group} observation {field.name!r}: {len(set(rows.tolist()))} of {bad.shape[1]} environments "
+                    f"{group} observation {field.name!r}: {numbers.size} of {bad.shape[1]} environments "
                     f"({some}), first at step {steps.min()}"
                 )
     if count := int(metrics["nonfinite_rewards"]):

@@ -13,7 +13,6 @@ import dataclasses
 import json
 import shlex
 import signal
-import statistics
 import sys
 import threading
 import time
@@ -21,11 +20,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
+
 from dexsim.core import cli
 
 if __name__ == "__main__":
     cli.announce(cli.LOADING)
 
+from dexsim.catalog import catalog
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
@@ -48,7 +50,7 @@ from dexsim_ppo.training.arguments import (
     printable,
     training_config,
 )
-from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
+from dexsim_ppo.training.fine_tune import check_network, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, draw_curve, folder_of, new_folder, read_metrics, taken
 from dexsim_ppo.training.trainer import Run
@@ -78,7 +80,7 @@ def train_policy(
     """Train a task from Python: what `python -m dexsim_ppo.train` does.
 
     Args:
-      task: a registered name; None for grasp, or the task of `policy` or `resume`.
+      task: a registered name; None for the task of `policy` or `resume`.
       config: the task's settings; None for the defaults.
       ppo: the learner's settings; None for the preset's.
       preset: sizes and durations, "auto", "cpu", "cpu-large" or "gpu".
@@ -87,22 +89,23 @@ def train_policy(
       options: other fields of `TrainArguments`, such as `minutes=5`, `seed=1`, `run_dir=Path("runs/mine")`.
 
     Raises:
-      ConfigError: an unknown task or option, or a value out of range.
+      ConfigError: an unknown task, or a value out of range.
+      TypeError: an unknown option.
       CheckpointError: the file to begin from is unsound, or does not fit.
       DexsimError: training diverged, or was stopped by a signal.
     """
     started = time.perf_counter()
     cli.enable_caches()
     source = find_source(task, str(policy or ""), resume)
+    if not (task or source):
+        raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
     given = {"env": config, "ppo": ppo, "policy": str(policy or "") or None, "resume": resume and Path(resume)}
     if "steps" in options and "minutes" not in options:
         given["minutes"] = 0.0
-    if "run_dir" in options:
-        options["run_dir"] = options["run_dir"] and Path(options["run_dir"])
+    if options.get("run_dir"):
+        options["run_dir"] = Path(options["run_dir"])
     given |= options
-    if unknown := sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)}):
-        raise ConfigError(f"train_policy has no option {unknown[0]!r}")
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
     if isinstance(source, checkpoint.Checkpoint):
         check_resumed(arguments, default)
@@ -118,8 +121,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     started = time.perf_counter()
     argv = list(sys.argv[1:] if argv is None else argv)
+    given = {argument.split("=")[0] for argument in argv}
+    if not given & {"--task", "--resume", "--policy", "--config", "-h", "--help"}:
+        print(overview(), file=sys.stderr)
+        return 2
     cli.enable_caches()
-    if any(argument.split("=")[0] == "--devices" for argument in argv):
+    if "--devices" in given:
         processes.connect()
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     with processes.exit_on_error():
@@ -136,6 +143,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}{task_option(run.arguments.task)}"
         )
     return 128 + stopped if stopped else 0
+
+
+def overview() -> str:
+    """What there is to train, for a command line that does not say it."""
+    return (
+        f"give a task: {', '.join(catalog()['tasks'])}\n"
+        "for example: python -m dexsim_ppo.train --task grasp\n"
+        "or a run to continue (--resume), a policy to fine-tune (--policy), a run whose options to use (--config); "
+        "--help lists all options"
+    )
 
 
 def make_run(
@@ -159,15 +176,14 @@ def make_run(
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
     if isinstance(source, Policy):
-        check_fit(source, env, arguments.ppo)
+        source.check_fit(env)
+        check_network(source, arguments.ppo)
     path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
     folder = RunFolder(processes.agree_on_path(path))
     if first and not resumed:
         folder.checkpoints.mkdir()
-        cli.write_json(
-            folder.config,
-            {"command": command, "arguments": printable(arguments), "hand": record_of(hand)} | cli.environment_report(),
-        )
+        record = {"command": command, "arguments": printable(arguments), "hand": record_of(hand)}
+        cli.write_json(folder.config, record | cli.environment_report())
     return Run(env, arguments, folder, started, mesh, like.evaluator if like else None)
 
 
@@ -205,33 +221,25 @@ def train_seeds(
     if first:
         reports = {run.arguments.seed: json.loads(run.folder.report.read_text()) for run in runs}
         measures = ("held", "return", "steps_held")
-        cli.write_json(
-            folder / "report.json",
-            {
-                "task": arguments.task,
-                "seeds": list(reports),
-                "trained": {name: spread([r["trained"][name]["value"] for r in reports.values()]) for name in measures},
-                "policies": {seed: f"seed-{seed}/{report['policy']}" for seed, report in reports.items()},
-                "command": command,
-            }
-            | cli.environment_report(),
-        )
+        report = {
+            "task": arguments.task,
+            "seeds": list(reports),
+            "trained": {name: spread([r["trained"][name]["value"] for r in reports.values()]) for name in measures},
+            "policies": {seed: f"seed-{seed}/{report['policy']}" for seed, report in reports.items()},
+            "command": command,
+        }
+        cli.write_json(folder / "report.json", report | cli.environment_report())
         draw_curve([read_metrics(run.folder.metrics) for run in runs], folder / "curve.png", arguments.task)
         print(f"report of {arguments.seeds} seeds: {folder / 'report.json'}")
     return runs[-1], 0
 
 
 def spread(values: Sequence[float | None]) -> dict[str, Any]:
-    """Mean, sample standard deviation, extremes and the values themselves, one for each seed; None, as a report has it
-    for a figure that is not finite, counts in the values alone."""
-    known = [value for value in values if value is not None]
-    return {
-        "mean": statistics.fmean(known) if known else None,
-        "std": statistics.stdev(known) if len(known) > 1 else None,
-        "min": min(known, default=None),
-        "max": max(known, default=None),
-        "values": list(values),
-    }
+    """Mean, sample standard deviation, extremes and the values themselves, one for each seed; those that are not
+    finite, None in a report, count in the values alone."""
+    x = np.array(values, float)
+    mean, std = np.nanmean(x), np.nanstd(x, ddof=1)
+    return {"mean": mean, "std": std, "min": np.nanmin(x), "max": np.nanmax(x), "values": list(values)}
 
 
 # --- options ------------------------------------------------------------------------------------------
@@ -276,13 +284,12 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     file = RunFolder(path).config if path.is_dir() else path
     try:
         saved = json.loads(file.read_text())["arguments"]
-        name = saved["task"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
-    if task and task.rpartition(":")[2] != name:
-        raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
+    if task and task.rpartition(":")[2] != saved["task"]:
+        raise ConfigError(f"--config {path}: is of the task {saved['task']!r}, not {task!r}")
     with naming_file(file):
-        return arguments_from_dict(find_task(task or name).config_class, saved)
+        return arguments_from_dict(find_task(task or saved["task"]).config_class, saved)
 
 
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:

@@ -97,13 +97,6 @@ def test_the_console_command_has_its_entry_point():
 
 
 @in_checkout
-def test_checkpoints_name_the_version_of_the_distribution():
-    from dexsim_ppo.checkpoint import LIBRARY_VERSION
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == LIBRARY_VERSION
-
-
 @in_checkout
 def test_the_commands_of_the_readme_are_make_targets():
     commands = re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE)

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from dexsim.core.assets import asset_path
-from dexsim_ppo.checkpoint import load
+from dexsim_ppo.policy import load_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORTS = ROOT / "docs" / "results"
@@ -161,7 +162,7 @@ def settings_of(row: Row) -> dict[str, Any]:
 @functools.cache
 def weights_of(file: Path) -> str:
     """Sixteen digits of the SHA-256 of a policy's arrays; a policy of other weights is another policy."""
-    leaves = load(file, kind="policy").leaves.values()
+    leaves = jax.tree.leaves(load_policy(file).params)
     return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]
 
 

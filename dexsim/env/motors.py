@@ -15,7 +15,6 @@ from dexsim.physics.interface import PhysicsState, TorqueLaw
 from dexsim.physics.physics import Physics
 from dexsim.randomization import HandParams, Randomization
 
-
 # s, in which Coulomb friction stops a joint: `apply_friction`'s dt. With the sub-step in its place forces of grips would
 # hang on the sub-step, since friction creeps under a contact's load at load dt / I: by .19 N (median) from 1 to 10 ms.
 _STOPPING = 0.006
@@ -109,7 +108,12 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
 def _largest_stiffness(ranges: Randomization) -> float:
     """k_p Nm/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
     high = 1 + ranges.scale * (ranges.stiffness_factor[1] - 1)
-    return (1 + ranges.scale * (ranges.efficiency[1] - 1)) * (1 + ranges.scale * ranges.ripple[1]) * ranges.stiffness * high
+    return (
+        (1 + ranges.scale * (ranges.efficiency[1] - 1))
+        * (1 + ranges.scale * ranges.ripple[1])
+        * ranges.stiffness
+        * high
+    )
 
 
 def _masses(hand: Hand) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,6 @@
 `python -m dexsim_ppo.train --task my_module:make_env` does the same with what `make_env()` returns.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -73,22 +72,22 @@ class Adapted:
     backend, evaluation, config = "own", "series", NoSettings()
 
     def __init__(self, env: SimpleEnvironment, name: str):
+        if missing := [member for member in MEMBERS if not hasattr(env, member)]:
+            raise ConfigError(f"environment {name!r}: a {type(env).__name__} has no {', '.join(missing)}")
         self.name, self._env = name, env
-        self._check()
         self.action_size, self.evaluation_steps = int(env.action_size), int(env.max_steps)
         self.control_period = float(getattr(env, "control_period", CONTROL_PERIOD))
         # One vector for both networks, scaled by its running statistics.
         layout = (LayoutEntry("observation", int(env.observation_size)),)
-        self.observation_layout: Mapping[str, Any] = {"actor": layout, "critic": layout}
+        self.observation_layout = {"actor": layout, "critic": layout}
 
     def reset(self, key: jax.Array) -> AdaptedState:
         """A new episode."""
         key, begin = jax.random.split(key)
         observation, inner = self._env.reset(begin)
         zero, no = jnp.float32(0), jnp.bool_(False)
-        return AdaptedState(
-            inner, self._observe(observation), zero, no, no, self._metrics(inner, zero, zero), jnp.int32(0), key
-        )
+        metrics = self._metrics(inner, zero, zero)
+        return AdaptedState(inner, self._observe(observation), zero, no, no, metrics, jnp.int32(0), key)
 
     def step(self, state: AdaptedState, action: jax.Array) -> AdaptedState:
         """One step; no automatic restart."""
@@ -126,7 +125,6 @@ class Adapted:
 
     def snapshot(self, state: AdaptedState) -> dict[str, jax.Array]:
         """Nothing: it is not drawn."""
-        del state
         return {}
 
     def _observe(self, observation: jax.Array) -> dict[str, jax.Array]:
@@ -135,37 +133,8 @@ class Adapted:
 
     def _metrics(self, inner: Any, total: jax.Array, length: jax.Array) -> dict[str, jax.Array]:
         own = self._env.metrics(inner) if hasattr(self._env, "metrics") else {}
-        return {name: jnp.asarray(value, jnp.float32) for name, value in own.items()} | {
-            "return": total,
-            "length": length,
-        }
-
-    def _check(self) -> None:
-        """Raises ConfigError: a member is missing, or gives another shape or type than `SimpleEnvironment` says."""
-        env, where = self._env, f"environment {self.name!r}"
-        if missing := [name for name in MEMBERS if not hasattr(env, name)]:
-            raise ConfigError(f"{where}: a {type(env).__name__} has no {', '.join(missing)}")
-        for name in MEMBERS[:3]:
-            if not isinstance(value := getattr(env, name), int | np.integer) or value < 1:
-                raise ConfigError(f"{where}: expected {name} to be a whole number of at least 1, got {value!r}")
-        key, action = jax.random.key(0), jax.ShapeDtypeStruct((int(env.action_size),), jnp.float32)
-        first, state = jax.eval_shape(env.reset, key)
-        second, after, reward, terminated = jax.eval_shape(env.step, key, state, action)
-        expected = (int(env.observation_size),)
-        for what, shape, got in (
-            ("reset: the observation", expected, first),
-            ("step: the observation", expected, second),
-            ("step: the reward", (), reward),
-            ("step: terminated", (), terminated),
-        ):
-            if got.shape != shape:
-                raise ConfigError(f"{where}: {what} must have the shape {shape}, got {got.shape}")
-        if terminated.dtype != bool:
-            raise ConfigError(f"{where}: step: terminated must be bool, got {terminated.dtype}")
-        # The state is carried through a compiled loop: it must stay what it is.
-        forms = [jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", tree) for tree in (state, after)]
-        if forms[0] != forms[1]:
-            raise ConfigError(f"{where}: step must return a state of the form of reset's, {forms[0]}, got {forms[1]}")
+        own = {name: jnp.asarray(value, jnp.float32) for name, value in own.items()}
+        return own | {"return": total, "length": length}
 
 
 def adapt(env: Any, name: str = "") -> Environment:
@@ -176,6 +145,6 @@ def adapt(env: Any, name: str = "") -> Environment:
       name: of the task, for reports and policies; that of the environment's class by default.
 
     Raises:
-      ConfigError: a member is missing, or gives something of another shape or type.
+      ConfigError: a member is missing.
     """
     return env if hasattr(env, "observation_layout") else Adapted(env, name or type(env).__name__)

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig:
+class PPOConfig(Config):
     """Settings of the learner."""
 
     num_envs: int = setting(4096, unit="1", low=1)
@@ -25,8 +25,6 @@ class PPOConfig:
     """Weight of the next step's return."""
     gae_lambda: float = setting(0.95, unit="1", low=0.0, high=1.0)
     """Weight of longer returns in the advantage."""
-    reward_scale: float = setting(1.0, unit="1", low=1e-9)
-    """Factor on rewards, seen by the learner only."""
     clip_ratio: float = setting(0.2, unit="1", low=1e-3, high=1.0)
     """Relative change of an action's probability beyond which its gradient is zero."""
     value_clip: float = setting(0.2, unit="value deviations", low=0.0)
@@ -49,8 +47,6 @@ class PPOConfig:
     """KL divergence per iteration that the learning rate adapts to; 0 keeps the rate fixed."""
     kl_halving: int = setting(0, unit="iterations", low=0)
     """Iterations after which `kl_target` has halved; after twice as many it is a third. 0 keeps it."""
-    distribution: Literal["gaussian", "tanh"] = setting("gaussian")
-    """Gaussian clipped by the environment, or squashed by tanh."""
     critic_first: int = setting(0, unit="iterations", low=0)
     """Initial iterations that train only the critic, at `learning_rate_max`: in fine-tuning the critic is new."""
     initial_std: float = setting(0.6, unit="1", low=1e-3, high=10.0)
@@ -67,8 +63,6 @@ class PPOConfig:
     """What the policy keeps of an episode: nothing, or the state of a gated recurrent unit."""
     memory_size: int = setting(64, unit="1", low=1, high=4096)
     """Units of `gru`. Its gradient goes back to the start of the rollout."""
-    normalize_value: bool = True
-    """Learn values in units of the running deviation of returns."""
     observation_std_floor: float = setting(1e-2, unit="observation units", low=0.0)
     """Smallest deviation that a running observation normaliser divides by."""
     observation_clip: float = setting(5.0, unit="1", low=0.1, high=1e4)
@@ -77,7 +71,7 @@ class PPOConfig:
     """Precision of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
 
     def __post_init__(self) -> None:
-        validate(self)
+        super().__post_init__()
         if self.rows % self.minibatches:
             of = "" if self.memory == "gru" else " * PPOConfig.rollout_length"
             raise ConfigError(

@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CurriculumConfig:
+class CurriculumConfig(Config):
     """How the scale of the randomisation ranges follows the success rate. The scale is part of the training state."""
 
     on: bool = setting(False)
@@ -28,7 +28,7 @@ class CurriculumConfig:
     """Change of the scale per iteration."""
 
     def __post_init__(self) -> None:
-        validate(self)
+        super().__post_init__()
         if self.narrow_below > self.widen_above:
             raise ConfigError(
                 f"CurriculumConfig.narrow_below = {self.narrow_below:g}: must not exceed "
@@ -41,9 +41,6 @@ def next_scale(scale: jax.Array, success: jax.Array, curriculum: CurriculumConfi
 
     A NaN success (no episode has ended) leaves the scale unchanged.
     """
-    step = jnp.where(
-        success >= curriculum.widen_above,
-        curriculum.step,
-        jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0),
-    )
+    narrower = jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0)
+    step = jnp.where(success >= curriculum.widen_above, curriculum.step, narrower)
     return jnp.clip(scale + step, 0.0, 1.0)

@@ -1,9 +1,4 @@
-"""Diagonal Gaussian over actions [..., A], optionally squashed by tanh.
-
-A squashed policy stores the Gaussian sample from before the tanh. The Jacobian of tanh then cancels in
-the probability ratio of old and new policy and in their KL divergence, so both are exactly those of
-the Gaussian; only the entropy needs `tanh_log_det`.
-"""
+"""Diagonal Gaussian over actions [..., A]; the environment gets samples clipped to [-1, 1]."""
 
 import math
 
@@ -17,7 +12,7 @@ from dexsim.core.pytree import align, pytree_dataclass
 class Decision:
     """A drawn action and the distribution that it is from; arrays [B, ...]."""
 
-    action: jax.Array  # [B, A] Gaussian sample before any squashing
+    action: jax.Array  # [B, A] before clipping
     mean: jax.Array  # [B, A]
     log_prob: jax.Array  # [B]
 
@@ -25,11 +20,6 @@ class Decision:
 def sample(noise: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """A random action [..., A], from standard normal noise of its shape."""
     return mean + align(jnp.exp(log_std), mean) * noise
-
-
-def squash(x: jax.Array, kind: str) -> jax.Array:
-    """A sample or mean [..., A] as an action in [-1, 1]; `kind` is `PPOConfig.distribution`."""
-    return jnp.tanh(x) if kind == "tanh" else jnp.clip(x, -1.0, 1.0)
 
 
 def log_prob(x: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
@@ -57,8 +47,3 @@ def bounds_loss(mean: jax.Array, limit: float = 1.1) -> jax.Array:
     Zero inside. Beyond the limit a clipped action no longer changes, so nothing else would bring the mean back.
     """
     return jnp.sum(jnp.maximum(jnp.abs(mean) - limit, 0.0) ** 2, axis=-1)
-
-
-def tanh_log_det(x: jax.Array) -> jax.Array:
-    """Log determinant of tanh's Jacobian at `x`, summed over the last axis; safe for large |x|."""
-    return jnp.sum(2.0 * (math.log(2.0) - x - jax.nn.softplus(-2.0 * x)), axis=-1)

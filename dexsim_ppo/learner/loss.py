@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import align, pytree_dataclass
+from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import Decision
@@ -89,13 +89,8 @@ def loss(
         errors = jnp.maximum(errors, (near - batch.target) ** 2)
     value_loss = 0.5 * jnp.mean(errors)
 
-    entropy, bounds_loss = distribution.entropy(params.log_std), jnp.float32(0)
-    if config.distribution == "tanh":
-        noise = (batch.decision.action - batch.decision.mean) * align(jnp.exp(-old_log_std), mean)
-        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * align(jnp.exp(params.log_std), mean)))
-    else:
-        bounds_loss = jnp.mean(distribution.bounds_loss(mean))
-
+    entropy = distribution.entropy(params.log_std)
+    bounds_loss = jnp.mean(distribution.bounds_loss(mean))
     total = (
         policy_loss
         + config.value_coefficient * value_loss

@@ -29,7 +29,7 @@ class Params:
     """All trained parameters."""
 
     actor: MLP
-    log_std: jax.Array  # [A], of the Gaussian before any squashing
+    log_std: jax.Array  # [A], of the Gaussian before clipping
     critic: MLP
     memory: Any = None  # `learner.memory.GRU` of the actor, or None
 

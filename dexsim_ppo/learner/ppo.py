@@ -34,7 +34,7 @@ from dexsim_ppo.learner.sharding import (
     shardings,
 )
 from dexsim_ppo.learner.state import TrainState, init_state
-from dexsim_ppo.learner.types import CurriculumEnvironment, Environment
+from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.learner.update import Learner, update
 
 
@@ -55,7 +55,7 @@ def make_train(
 
     Args:
       env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
-      mesh: devices to spread the environments over (`learner.devices.sharding`); None for one.
+      mesh: devices to spread the environments over (`learner.sharding`); None for one.
 
     Raises:
       ConfigError: JAX is set to float64, or the environment lacks something.
@@ -110,9 +110,7 @@ def train_iteration(
     (env_state, carry), rollout, metrics = collect_rollout(env, config, state, mesh)
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
-    if config.normalize_value:
-        rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
-        metrics |= {"bounded_rewards": bounded}
+    rollout, bounded = bound_rewards(rollout, state.value_stats)
     batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
     learner, update_metrics = update(
         config,
@@ -123,6 +121,7 @@ def train_iteration(
         mesh,
     )
     metrics |= update_metrics | {
+        "bounded_rewards": bounded,
         "explained_variance": batch.explained_variance,
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate,
@@ -132,7 +131,7 @@ def train_iteration(
     if curriculum is not None and scale is not None:
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
-        env_state = jax.vmap(cast(CurriculumEnvironment, env).set_randomization_scale, (0, None))(env_state, scale)
+        env_state = jax.vmap(cast(Any, env).set_randomization_scale, (0, None))(env_state, scale)
     return TrainState(
         params=learner.params,
         adam=learner.adam,
@@ -187,7 +186,7 @@ def prepare(
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
     advantage, target = compute_gae(
-        config.reward_scale * rollout.reward,
+        rollout.reward,
         rollout.value,
         rollout.next_value,
         rollout.terminated,
@@ -204,11 +203,10 @@ def prepare(
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
         for group, stats in observation_stats.items()
     }
-    if config.normalize_value:
-        new = merge_moments(value_stats, means["target"], variances["target"], size)
-        critic = rescale_output(params.critic, value_stats.mean, value_std(value_stats), new.mean, value_std(new))
-        params, value_stats = dataclasses.replace(params, critic=critic), new
+    old_mean, old_std = value_stats.mean, value_std(value_stats)
+    value_stats = merge_moments(value_stats, means["target"], variances["target"], size)
     mean, std = value_stats.mean, value_std(value_stats)
+    critic = rescale_output(params.critic, old_mean, old_std, mean, std)
     samples = Samples(
         obs=rollout.obs,
         decision=rollout.decision,
@@ -226,6 +224,7 @@ def prepare(
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
         samples = sequences_in_blocks(samples, blocks)
     explained = 1 - variances["error"] / variances["target"]
+    params = dataclasses.replace(params, critic=critic)
     return TrainingBatch(samples, params, value_stats, observation_stats, explained)
 
 

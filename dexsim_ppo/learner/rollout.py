@@ -59,32 +59,38 @@ def collect_rollout(
         return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, carry)
 
     def step(now, key):
-        env_state, carry = now
+        env_state, carry, value_now = now
         obs = dict(env_state.obs)
         next_carry, mean = actor_step(config, params, normalizers, obs, carry)
         action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
-        after = step_env(env_state, distribution.squash(action, config.distribution))
+        after = step_env(env_state, jnp.clip(action, -1.0, 1.0))
+        next_value = value(after.obs, next_carry)
         record = Rollout(
             obs=obs,
             decision=Decision(action, mean, distribution.log_prob(action, mean, params.log_std)),
-            value=value(obs, carry),
-            next_value=value(after.obs, next_carry),
+            value=value_now,
+            next_value=next_value,
             reward=after.reward,
             terminated=after.terminated,
             truncated=after.truncated,
             carry=carry,
         )
-        return (after, next_carry), after.terminated | after.truncated, (record, dict(after.metrics))
+        return (after, next_carry, next_value), after.terminated | after.truncated, (record, dict(after.metrics))
 
-    def restart(now, done):
-        env_state, carry = now
+    def begin(env_state, carry, done):
         return env.restart(env_state, done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), carry)
 
+    def restart(now, done):
+        env_state, carry = batched(begin, mesh)(*now[:2], done)
+        return env_state, carry, jnp.where(done, value(env_state.obs, carry), now[2])
+
+    # The value travels with the state: that of the next observation is the next step's, but where an episode begins.
+    first = state.env_state, state.carry, value(state.env_state.obs, state.carry)
     keys = jax.random.split(key, config.rollout_length)
-    last, (rollout, step_metrics) = scan_restarting(batched(restart, mesh), step, (state.env_state, state.carry), keys)
+    (*last, _), (rollout, step_metrics) = scan_restarting(restart, step, first, keys)
     finite = jnp.isfinite(rollout.reward)
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
-    return last, rollout, rollout_metrics(rollout, finite, step_metrics)
+    return tuple(last), rollout, rollout_metrics(rollout, finite, step_metrics)
 
 
 def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
@@ -160,12 +166,11 @@ def scan_restarting(
     return state, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), outputs)
 
 
-def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tuple[Rollout, jax.Array]:
+def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax.Array]:
     """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations.
 
     Args:
-      returns: statistics of the returns so far [], in units of scaled rewards.
-      scale: factor on rewards.
+      returns: statistics of the returns so far [].
 
     Returns:
       The experience, and the number [] of rewards that were bounded.
@@ -173,8 +178,8 @@ def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tupl
     size = jnp.abs(rollout.reward).reshape(-1)
     others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
     spread = jnp.sqrt(jnp.mean(others**2))
-    at_first = _FAR_AT_FIRST * jnp.where(spread > 0, spread, 1.0 / scale)  # A sparse reward may come once.
-    limit = jnp.where(returns.count > 0, _FAR * value_std(returns) / scale, at_first)
+    at_first = _FAR_AT_FIRST * jnp.where(spread > 0, spread, 1.0)  # A sparse reward may come once.
+    limit = jnp.where(returns.count > 0, _FAR * value_std(returns), at_first)
     bounded = jnp.sum(size > limit, dtype=jnp.float32)
     return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded
 

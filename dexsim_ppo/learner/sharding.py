@@ -57,15 +57,10 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
 
 def batched(function: Callable, mesh: Mesh | None) -> Callable:
     """`jax.vmap(function)` whose batch is split over the mesh; arguments and results are [B, ...]."""
-    return on_each(jax.vmap(function), mesh)
-
-
-def on_each(function: Callable, mesh: Mesh | None) -> Callable:
-    """`function` on each device's own part of arguments and results [N, ...]; without a mesh on the whole."""
     if mesh is None:
-        return function
+        return jax.vmap(function)
     split = PartitionSpec(AXIS)
-    return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+    return jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
 
 
 def averaged(function: Callable, mesh: Mesh | None) -> Callable:
@@ -147,16 +142,6 @@ def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[
         return compiled(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
 
     return init_sharded
-
-
-def mesh_of(state: Any) -> Mesh:
-    """The mesh that a `TrainState` is on."""
-    return state.iteration.sharding.mesh
-
-
-def without_environments(state: Any) -> Any:
-    """A `TrainState` without its environments, as arrays of this process, whatever devices it is on."""
-    return jax.device_get(dataclasses.replace(state, env_state=None, carry=None, key=None))
 
 
 def place(tree: Tree, like: Any) -> Tree:

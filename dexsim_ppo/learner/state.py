@@ -17,7 +17,7 @@ from dexsim_ppo.learner.memory import carry_size, init_gru, zero_carry
 from dexsim_ppo.learner.networks import Params, init_params
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats
 from dexsim_ppo.learner.sharding import batched
-from dexsim_ppo.learner.types import CurriculumEnvironment, Environment
+from dexsim_ppo.learner.types import Environment
 
 
 @pytree_dataclass
@@ -60,7 +60,7 @@ def init_state(
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
     reset = env.reset
     if curriculum is not None:
-        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=jnp.float32(curriculum.start))
+        reset = functools.partial(cast(Any, env).reset, scale=jnp.float32(curriculum.start))
     return TrainState(
         params=params,
         adam=adam.init(params),

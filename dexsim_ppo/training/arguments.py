@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from dexsim.core.config import NoSettings, from_dict, setting, to_dict, validate
+from dexsim.core.config import Config, from_dict, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -20,7 +20,7 @@ EnvConfig = TypeVar("EnvConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainArguments(Generic[EnvConfig]):
+class TrainArguments(Config, Generic[EnvConfig]):
     """Options of `python -m dexsim_ppo.train`."""
 
     env: EnvConfig
@@ -32,7 +32,7 @@ class TrainArguments(Generic[EnvConfig]):
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of training's hands and objects that get the extreme of every range at once. Evaluations and the policy's
     file keep to the settings of `--env`."""
-    task: str = "grasp"
+    task: str = ""
     """Task to train; my_module:poke for a task of your own."""
     hand: str = ""
     """The TOML of a hand of your own, or the name of a shipped one; empty for the XHand."""
@@ -86,9 +86,7 @@ class TrainArguments(Generic[EnvConfig]):
     """Episodes of the final evaluation."""
 
     def __post_init__(self) -> None:
-        validate(self)
-        if self.seed + self.seeds > 2**32:
-            raise ConfigError(f"TrainArguments.seeds = {self.seeds}: the last seed must be at most {2**32 - 1}")
+        super().__post_init__()
         if self.patience and not self.evaluate_every:
             raise ConfigError(
                 f"TrainArguments.patience = {self.patience}: needs evaluations, TrainArguments.evaluate_every"
@@ -123,46 +121,23 @@ def training_config(arguments: TrainArguments) -> Any:
     """The task's configuration as training uses it: with its share of extremes, and without a force loop.
 
     A policy that does not follow its command yet learns from a loop to ignore a command that drifts.
-
-    Raises:
-      ConfigError: extremes or a curriculum for a task without randomisation ranges.
     """
     env, share = arguments.env, arguments.extremes
-    if arguments.curriculum.on and isinstance(env, NoSettings):
-        raise ConfigError("CurriculumConfig.on = True: an environment from elsewhere has no ranges that could widen")
     control = getattr(env, "control", None)
     if control is not None and control.force.gain:
-        env = dataclasses.replace(
-            env, control=dataclasses.replace(control, force=dataclasses.replace(control.force, gain=0.0))
-        )
-    if not share:
-        return env
-    if not (hasattr(env, "randomization") and hasattr(env, "objects")):
-        raise ConfigError(f"--extremes {share:g}: task {arguments.task!r} has no randomisation ranges")
-    return dataclasses.replace(
-        env,
-        randomization=dataclasses.replace(env.randomization, extremes=share),
-        objects=dataclasses.replace(env.objects, extremes=share),
-    )
+        force = dataclasses.replace(control.force, gain=0.0)
+        env = dataclasses.replace(env, control=dataclasses.replace(control, force=force))
+    if share:
+        parts = {name: dataclasses.replace(getattr(env, name), extremes=share) for name in ("randomization", "objects")}
+        env = dataclasses.replace(env, **parts)
+    return env
 
 
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {
-    "checkpoint_every",
-    "devices",
-    "evaluate_every",
-    "evaluation_chunk",
-    "evaluation_episodes",
-    "evaluation_share",
+    *("checkpoint_every", "devices", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "evaluation_share"),
+    *("keep_checkpoints", "log_every", "minutes", "patience", "resume", "steps", "video", "wandb"),
     "hand",  # where its files are: their content must be the same
-    "keep_checkpoints",
-    "log_every",
-    "minutes",
-    "patience",
-    "resume",
-    "steps",
-    "video",
-    "wandb",
 }
 
 
@@ -192,5 +167,5 @@ def _differences(new: Any, old: Any) -> Iterator[tuple[type, str, Any, Any]]:
 
 def printable(arguments: TrainArguments) -> dict[str, Any]:
     """The options as plain data, without the paths of this process."""
-    data = to_dict(dataclasses.replace(arguments, run_dir=None, resume=None, config=None))
-    return {k: v for k, v in data.items() if k not in ("run_dir", "resume", "config")}
+    paths = ("run_dir", "resume", "config")
+    return {name: value for name, value in to_dict(arguments).items() if name not in paths}

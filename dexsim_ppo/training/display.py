@@ -1,5 +1,6 @@
 """Live view of training: a panel of 80 columns on a terminal, plain lines elsewhere."""
 
+import itertools
 import math
 from typing import Any
 
@@ -21,8 +22,6 @@ COLUMNS = (
     ("std", "action_std", ".2f"),
 )
 _WIDTH = 80
-_BARS = "▁▂▃▄▅▆▇█"
-_PAST = 18  # returns in the sparkline
 
 
 class Display:
@@ -37,11 +36,8 @@ class Display:
         self.console = Console()
         self.console.quiet = quiet
         self._title = title
-        self._live = (
-            Live(console=self.console, refresh_per_second=4) if self.console.is_terminal and not quiet else None
-        )
-        self._known: dict[str, Any] = {}
-        self._returns: list[float] = []
+        self._live = Live(console=self.console) if self.console.is_terminal and not quiet else None
+        self._latest: dict[str, Any] = {}
 
     def __enter__(self) -> "Display":
         if self._live:
@@ -65,10 +61,8 @@ class Display:
 
     def show(self, row: dict[str, Any]) -> None:
         """Show the newest metrics. A NaN (no episode has ended) keeps the last value."""
-        self._known |= {k: v for k, v in row.items() if not (isinstance(v, float) and math.isnan(v))}
-        if "episode/return" in self._known:
-            self._returns = [*self._returns, self._known["episode/return"]][-_PAST:]
-        cells = self._cells(self._known)
+        self._latest |= {k: v for k, v in row.items() if not (isinstance(v, float) and math.isnan(v))}
+        cells = self._cells(self._latest)
         if self._live:
             self._live.update(self._panel(cells), refresh=True)
         else:
@@ -76,30 +70,20 @@ class Display:
 
     def _panel(self, cells: dict[str, str]) -> RenderableType:
         """Title, progress bar and times, and the other cells in two columns."""
-        elapsed, left = self._known["seconds"], self._known["seconds_left"]
-        width = min(self.console.width, _WIDTH)
+        elapsed, left = self._latest["seconds"], self._latest["seconds_left"]
+        times, total = f"elapsed {duration(elapsed)}", max(elapsed + left, 1e-9)
         top = Table.grid(padding=(0, 2))
         if math.isfinite(left):
-            total = max(elapsed + left, 1e-9)
-            bar = ProgressBar(total, elapsed, width=width // 2)
-            top.add_row(bar, f"{elapsed / total:.0%}, elapsed {duration(elapsed)}, left {cells.pop('left')}")
+            bar = ProgressBar(total, elapsed, width=min(self.console.width, _WIDTH) // 2)
+            top.add_row(bar, f"{elapsed / total:.0%}, {times}, left {duration(left)}")
         else:
-            top.add_row(f"elapsed {duration(elapsed)}")
-            del cells["left"]
-        table = Table.grid(padding=(0, 2), expand=True)
-        for _ in range(2):
-            table.add_column(style="dim", ratio=3)
-            table.add_column(justify="right", ratio=4)
-        entries = [(name, value) for name, value in cells.items()]
-        if self._returns:
-            entries.insert(0, ("return so far", sparkline(self._returns)))
+            top.add_row(times)
+        table = Table.grid(padding=(0, 3))
+        entries = [entry for entry in cells.items() if entry[0] != "left"]
         half = -(-len(entries) // 2)
-        for first, second in zip(entries[:half], [*entries[half:], ("", "")], strict=False):
+        for first, second in itertools.zip_longest(entries[:half], entries[half:], fillvalue=("", "")):
             table.add_row(*first, *second)
-        frame = Table.grid()
-        frame.add_column(width=width)
-        frame.add_row(table)
-        return Group(self._title, top, frame)
+        return Group(self._title, top, table)
 
     @staticmethod
     def _cells(row: dict[str, Any]) -> dict[str, str]:
@@ -121,13 +105,6 @@ class Display:
             if row.get(f"total/{kind}_rewards"):
                 cells[f"{kind} rewards"] = f"{row[f'total/{kind}_rewards']:.0f}"
         return cells
-
-
-def sparkline(values: list[float]) -> str:
-    """Numbers as bars of eight heights, the lowest and the highest of them at the ends of the scale."""
-    low, high = min(values), max(values)
-    top = len(_BARS) - 1
-    return "".join(_BARS[round(top * (value - low) / (high - low)) if high > low else 0] for value in values)
 
 
 def count(x: float) -> str:

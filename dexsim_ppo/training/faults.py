@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +11,9 @@ from dexsim.core.errors import DexsimError
 from dexsim.registry import task_option
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.state import TrainState
-from dexsim_ppo.training import processes
 from dexsim_ppo.training.runlog import RunFolder
 
 DIVERGED_AFTER = 5  # calls in a row that skip more than half of their updates
-KEPT = 3  # reproducers of one run
 COUNTED = ("nonfinite_rewards", "bounded_rewards")
 
 # The step donates its state, so what a reproducer needs is copied before: one launch for all arrays.
@@ -29,17 +26,26 @@ class Faults:
     Args:
       config: the learner's settings.
       folder: where reproducers go.
-      content: what a reproducer has to know of the run beside its state.
+      task: the task's name.
       state: the state that training begins from.
+      save: writes a state to a file, as a checkpoint.
     """
 
-    def __init__(self, config: PPOConfig, folder: RunFolder, content: dict[str, Any], state: TrainState):
-        self._per_call = config.iterations_per_call * config.epochs * config.minibatches
+    def __init__(
+        self,
+        config: PPOConfig,
+        folder: RunFolder,
+        task: str,
+        state: TrainState,
+        save: Callable[[Path, TrainState], None],
+    ):
         self._per_iteration = config.epochs * config.minibatches
-        self._folder, self._content = folder, content
+        self._per_call = config.iterations_per_call * self._per_iteration
+        self._folder, self._task, self._save = folder, task, save
         self._skipped, self._totals = int(state.skipped_updates), dict.fromkeys(COUNTED, 0.0)
         self._clean_until, self._bad_calls = int(state.iteration), 0
-        self._clean, self._files = True, list[Path]()
+        self._clean = True
+        self._file: Path | None = None
 
     def check(
         self, before: TrainState, metrics: dict[str, np.ndarray], iteration: int, note: Callable[[str], None]
@@ -62,7 +68,7 @@ class Faults:
             self._clean = False
             note(
                 f"iteration {iteration}: {lost} of {self._per_call} updates skipped, their gradient is not finite"
-                f"{self._write(before, lost)}"
+                f"{self._write(before)}"
             )
         self._bad_calls = self._bad_calls + 1 if 2 * lost > self._per_call else 0
         if self._bad_calls >= DIVERGED_AFTER:
@@ -78,23 +84,21 @@ class Faults:
             **{f"total/{name}": value for name, value in self._totals.items()},
         }
 
-    def _write(self, before: TrainState, lost: int) -> str:
-        """Write a reproducer; how to replay it."""
-        if len(self._files) >= KEPT:
-            return ""
-        path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
-        try:
-            processes.save(
-                path, kind="reproducer", task=self._content["task"], tree=before, content=self._content | {"lost": lost}
-            )
-        except OSError as error:  # A full disk is no reason to stop.
-            return f"; {path} could not be written ({error.strerror})"
-        self._files.append(path)
+    def _write(self, before: TrainState) -> str:
+        """Write the first fault's reproducer; how to replay it."""
+        if self._file is None:
+            path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
+            try:
+                self._save(path, before)
+            except OSError as error:  # A full disk is no reason to stop.
+                return f"; {path} could not be written ({error.strerror})"
+            self._file = path
         return self._how_to_replay()
 
     def _how_to_replay(self) -> str:
-        option = task_option(self._content["task"])
-        return f"; replay: python -m dexsim_ppo.reproduce {self._files[-1]}{option}" if self._files else ""
+        if self._file is None:
+            return ""
+        return f"; replay: python -m dexsim_ppo.reproduce {self._file}{task_option(self._task)}"
 
     def _from_before(self) -> str:
         """Which checkpoints are from before the fault: later ones hold its state."""

@@ -11,7 +11,6 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.memory import carry_size
 from dexsim_ppo.learner.running_stats import recover_stats
 from dexsim_ppo.learner.state import TrainState
-from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 
 
@@ -32,7 +31,6 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
         memory="gru" if units else "none",
         memory_size=units or config.memory_size,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
-        distribution=policy.params.squash,
         observation_clip=normalizer.clip,
         observation_std_floor=floor,
         learning_rate=1e-5,
@@ -45,22 +43,12 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
     )
 
 
-def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
-    """Check that a learner with this configuration can start from the policy.
-
-    Raises:
-      ConfigError: the policy's observation is not the environment's, or its network is not the configuration's.
-    """
-    theirs, mine = policy.observation_layout, tuple(env.observation_layout["actor"])
-    if theirs != mine:
-        different = sorted({entry.name for entry in set(theirs) ^ set(mine)})
-        raise ConfigError(f"observations of policy and environment differ: {', '.join(different) or 'their order'}")
+def check_network(policy: Policy, config: PPOConfig) -> None:
+    """Raises ConfigError: the policy's network is not that of a learner with this configuration."""
     network = fine_tuning_config(policy, config)
-    for name in ("memory", "memory_size", "actor_layers", "distribution"):
+    for name in ("memory", "memory_size", "actor_layers"):
         if getattr(config, name) != getattr(network, name):
             raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: the policy has {getattr(network, name)}")
-    if (actions := policy.params.layers[-1].bias.size) != env.action_size:
-        raise ConfigError(f"the policy gives {actions} actions; {env.name} takes {env.action_size}")
 
 
 def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:

@@ -7,15 +7,16 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
-from dexsim_ppo.learner.sharding import copied, mesh_of
+from dexsim_ppo.learner.sharding import copied
 from dexsim_ppo.learner.state import TrainState
 
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
@@ -64,8 +65,8 @@ def agree_on_path(path: Path) -> Path:
 def save(path: Path, *, tree: TrainState, **content: Any) -> None:
     """`checkpoint.save` of the global state, written by the first process. All must call it."""
     if jax.process_count() > 1:  # A process can read what every device has, and no other process's environments.
-        mesh = mesh_of(tree)
-        tree = jax.jit(functools.partial(copied, mesh=mesh))(tree)
+        mesh = cast(NamedSharding, tree.iteration.sharding).mesh
+        tree = jax.jit(functools.partial(copied, mesh=cast(Mesh, mesh)))(tree)
     if is_first():
         checkpoint.save(path, tree=tree, **content)
 

@@ -168,7 +168,12 @@ class MetricsLog:
         folder.set_aside(first_iteration)
         self._file = self._closing.enter_context(folder.metrics.open("a", buffering=1))
         self._tensorboard = _tensorboard_writer(folder.path)
-        self._wandb = _wandb_run(folder.path, arguments) if arguments.wandb else None
+        self._wandb = None
+        if arguments.wandb:
+            import wandb
+
+            config = printable(arguments)
+            self._wandb = wandb.init(project=arguments.wandb, name=folder.path.name, dir=folder.path, config=config)
 
     def write(self, row: dict[str, Any]) -> None:
         """Log one iteration: `"iteration"`, `"env_steps"` and any scalars."""
@@ -222,12 +227,6 @@ def _tensorboard_writer(path: Path) -> Any:
     return None
 
 
-def _wandb_run(path: Path, arguments: TrainArguments) -> Any:
-    import wandb
-
-    return wandb.init(project=arguments.wandb, name=path.name, dir=path, config=printable(arguments))
-
-
 def check_wandb(project: str) -> None:
     """Raises DexsimError: metrics are to go to a Weights & Biases project, and its library is not installed."""
     if project:
@@ -242,9 +241,8 @@ def draw_curve(runs: Sequence[list[dict[str, Any]]], path: Path, title: str) -> 
     import matplotlib.pyplot as plt
 
     rows = [row for run in runs for row in run]
-    errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
-    own = [name for name in errors if name not in CURVES]
-    words = CURVES | {name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in own}
+    own = {name for row in rows for name in row if name.startswith("step/") and name.endswith("error")} - set(CURVES)
+    words = CURVES | {name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in sorted(own)[:1]}
     names = [name for name in words if any(row.get(name) is not None for row in rows)]
     if not names:
         return
@@ -259,15 +257,11 @@ def draw_curve(runs: Sequence[list[dict[str, Any]]], path: Path, title: str) -> 
 
     for ax, name in zip(axes[:, 0], names, strict=True):
         for run in runs:
-            draw(ax, run, name, "-", lw=1.2, label="training" if len(runs) == 1 else None)
+            draw(ax, run, name, "-", lw=1.2)
         ax.set_ylabel(words[name])
         ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
-        if name == "episode/success":
-            ax.set_ylim(-0.03, 1.03)
-    if len(runs) == 1 and any(row.get("evaluation/return") is not None for row in rows):
+    if len(runs) == 1:
         draw(axes[0, 0], runs[0], "evaluation/return", "o", ms=4, label="evaluation")
-        axes[0, 0].legend(frameon=False)
     minutes = rows[-1]["seconds"] / 60
     axes[0, 0].set_title(title + (f", {minutes:.1f} min" if len(runs) == 1 else f", {len(runs)} seeds"), loc="left")
     axes[-1, 0].set_xlabel("environment steps [million]")

@@ -23,7 +23,7 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
-from dexsim_ppo.learner.sharding import place, without_environments
+from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.report import headline, print_report, significantly_better
@@ -169,7 +169,8 @@ class Run:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
-        faults, evaluated = Faults(self.config, self.folder, self.content(), state), iteration == 0
+        faults = Faults(self.config, self.folder, arguments.task, state, self._save_checkpoint)
+        evaluated = iteration == 0
         while not stopped() and not processes.agree(self._is_over(iteration)):
             call = time.perf_counter()
             before = keep(state)
@@ -249,27 +250,16 @@ class Run:
 
     # --- files and reports --------------------------------------------------------------------------------
 
-    def content(self) -> dict[str, Any]:
-        """What a reproducer has to know of the run."""
-        return {
-            "task": self.arguments.task,
-            "backend": self.env.backend,
-            "hand": record_of(getattr(self.env, "hand", None)),
-            "arguments": printable(self.arguments),
-            "calls": self.config.iterations_per_call,
-        }
-
     def _policy(self, state: TrainState) -> Policy:
-        if self.mesh is not None:
-            state = without_environments(state)
+        learner = jax.device_get(dataclasses.replace(cast(Any, state), env_state=None, carry=None, key=None))
         return Policy.from_training(
             self.evaluator.env,
             self.config,
-            state,
+            learner,
             {
                 "seed": self.arguments.seed,
-                "iteration": int(state.iteration),
-                "env_steps": int(state.iteration) * self.config.steps_per_iteration,
+                "iteration": int(learner.iteration),
+                "env_steps": int(learner.iteration) * self.config.steps_per_iteration,
                 "backend": self.env.backend,
                 "ppo": to_dict(self.config),
             }
@@ -298,8 +288,14 @@ class Run:
 
     def _save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint, from which training resumes exactly, and the current policy."""
+        self._save_checkpoint(self.folder.checkpoint(iteration), state)
+        if processes.is_first():
+            self.folder.prune(self.arguments.keep_checkpoints)
+        self._write_policy(self._policy(state), self.folder.last)
+
+    def _save_checkpoint(self, path: Path, state: TrainState) -> None:
         processes.save(
-            self.folder.checkpoint(iteration),
+            path,
             kind="train",
             task=self.arguments.task,
             tree=state,
@@ -309,9 +305,6 @@ class Run:
                 "progress": {"best": self.best, "seconds": self._seconds(), "without_better": self.without_better},
             },
         )
-        if processes.is_first():
-            self.folder.prune(self.arguments.keep_checkpoints)
-        self._write_policy(self._policy(state), self.folder.last)
 
     def _write_policy(self, policy: Policy, path: Path) -> None:
         if processes.is_first():

@@ -15,7 +15,6 @@ from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
 from dexsim.task_spec import correct_readings
-from dexsim_ppo.export import ExportedPolicy
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
@@ -58,7 +57,7 @@ class Controller:
         actions than the hand has joints.
     """
 
-    def __init__(self, policy: Policy | ExportedPolicy, hand: Hand):
+    def __init__(self, policy: Policy, hand: Hand):
         self.policy, self.hand = policy, hand
         if policy.spec is None:
             raise HandError(f"the policy of the task {policy.task!r} carries no task specification")
@@ -124,8 +123,8 @@ class Controller:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))
-        carry, action = self.policy.act(self.carry, observation)
-        action = np.clip(np.asarray(action), -1.0, 1.0)
+        carry, mode = self.policy.act(self.carry, observation)
+        action = np.clip(np.asarray(mode), -1.0, 1.0)
         if np.isfinite(action).all():
             self.carry = carry
             target = self.target = jax.device_get(self._move(self.target, action, measured.joint_position))

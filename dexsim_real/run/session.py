@@ -18,7 +18,6 @@ from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
-from dexsim_ppo.export import load_exported
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.motors_off import UNCONFIRMED
@@ -61,8 +60,7 @@ class Session:
         self.arguments = arguments
         guarded = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if guarded else None
-        exported = arguments.policy.endswith((".npz", ".onnx"))
-        policy: Any = (load_exported if exported else load_policy)(arguments.policy)
+        policy = load_policy(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.controller = Controller(policy, calibrated_hand(hand, calibration))

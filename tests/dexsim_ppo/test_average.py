@@ -5,10 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+import tiny_train
+from tiny_train import PER_ITERATION
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo import load_policy
+from dexsim_ppo import average, load_policy, train
 from dexsim_ppo.average import average_policies, distance, main
+from dexsim_ppo.training.runlog import RunFolder
 
 
 def moved(policy, size, seed):
@@ -34,30 +37,17 @@ def test_the_average_of_many_noisy_copies_comes_back_to_the_policy(name):
     assert np.linalg.norm(mean - wanted) < np.linalg.norm(one - wanted)
 
 
-def test_a_tree_of_two_is_halfway_and_a_file_holds_it(tmp_path):
-    one, other = (moved(load_policy("rotate_clear"), 0.1, seed) for seed in (1, 2))
-    files = [str(tmp_path / f"{k}.msgpack") for k in (1, 2)]
-    for policy, file in zip((one, other), files, strict=True):
-        policy.save(file)
-    assert main([*files, "--output", str(tmp_path / "made" / "average.msgpack")]) == 0
-    found = load_policy(tmp_path / "made" / "average.msgpack")
-    for a, b, mean in zip(*(jax.tree.leaves(p.params) for p in (one, other, found)), strict=True):
-        np.testing.assert_allclose(mean, a + (b - a) / 2, rtol=1e-5, atol=1e-7)
-    assert found.training == {"average_of": [{"seed": 1}, {"seed": 2}]}
-    assert found.env_config == one.env_config
-
-
 def test_what_has_no_common_origin_is_refused(tmp_path):
     clear, rotate = load_policy("rotate_clear"), load_policy("rotate")
     stranger = moved(clear, 20.0, 0)
     with pytest.raises(ConfigError, match=r"policy 3 has no common origin with the first: weights differ by \d+%"):
         average_policies([clear, moved(clear, 0.1, 1), stranger])
-    with pytest.raises(ConfigError, match="policy 2 differs from the first in observation, memory, layers"):
+    with pytest.raises(ConfigError, match="policy 2 differs from the first in observation_layout, .*memory"):
         average_policies([rotate, load_policy("rotate_without_orientation")])
     with pytest.raises(ConfigError, match="policy 2 differs from the first in task"):
         average_policies([rotate, load_policy("grasp")])
     other = dataclasses.replace(rotate.spec, control=dataclasses.replace(rotate.spec.control, step=0.5))
-    with pytest.raises(ConfigError, match="policy 2 differs from the first in control$"):
+    with pytest.raises(ConfigError, match="policy 2 differs from the first in spec$"):
         average_policies([rotate, dataclasses.replace(rotate, spec=other)])
     with pytest.raises(ConfigError, match="two policies or more"):
         average_policies([rotate])
@@ -67,13 +57,34 @@ def test_what_has_no_common_origin_is_refused(tmp_path):
     assert not output.exists()
 
 
-def test_no_averaged_policy_is_overwritten(tmp_path):
-    files = [tmp_path / "1.msgpack", tmp_path / "2.msgpack"]
-    for k, file in enumerate(files):
-        moved(load_policy("rotate_clear"), 0.1, k).save(file)
-    (tmp_path / "link.msgpack").symlink_to(files[1])
-    before = files[1].read_bytes()
-    for output in (files[1], tmp_path / "link.msgpack"):
-        with pytest.raises(ConfigError, match=f"^--output {output}: is the policy"):
-            main([*map(str, files), "--output", str(output)])
-    assert files[1].read_bytes() == before
+QUICK = [*tiny_train.QUICK, "--seed", "3"]
+
+
+@pytest.mark.slow
+def test_a_run_stands_for_the_policies_of_its_checkpoints(tmp_path, monkeypatch):
+    tiny_train.install(monkeypatch)
+    run = RunFolder(tmp_path / "a")
+    policies = []
+    for steps in (1, 3):  # Each time it ends it writes a checkpoint, and the policy as it is.
+        begin = (
+            [*QUICK, "--ppo.memory", "gru", "--run-dir", str(run.path)] if steps == 1 else ["--resume", str(run.path)]
+        )
+        assert train.main([*begin, "--steps", str(steps * PER_ITERATION)]) == 0
+        policies.append(load_policy(run.last))
+
+    found = average.policies_of(run.path)
+    assert [path.name for path in found] == ["00000001.msgpack", "00000003.msgpack"]
+    for policy, copy in zip(found.values(), policies, strict=True):
+        assert policy.training == copy.training
+        for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(copy.params), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+    with pytest.raises(ConfigError, match="name another file"):
+        average.main([str(run.path), "--output", str(run.last)])
+    output = tmp_path / "average.msgpack"
+    assert average.main([str(run.path), "--output", str(output)]) == 0
+    expected = average_policies(policies)
+    mean = load_policy(output)
+    assert mean.training["average_of"] == [policy.training for policy in policies]
+    for a, b in zip(jax.tree.leaves(mean.params), jax.tree.leaves(expected.params), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,6 +1,8 @@
 """How many episodes are measured and which, and what is made of the totals of long ones."""
 
+import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +11,11 @@ import pytest
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
-from dexsim.render import render
+from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import evaluate, load_policy
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import mean_interval, summarize_totals
+from dexsim_ppo.report import mean_interval, summarize
 
 
 class Totals(TinyEnv):
@@ -50,75 +52,45 @@ def test_totals_are_those_of_the_series(policy):
     assert totals["task"] == {"lived": [32] * 8}
 
 
-def test_an_episode_of_totals_is_held_to_its_last_tick():
-    env = SimpleNamespace(evaluation_steps=9, summarize=lambda metrics, lived: {"ticks": int(lived.sum())})
-    report = summarize_totals(env, {"return": np.array([1.0, 2.0, 6.0])}, np.array([9, 8, 9]), np.arange(3))
-    assert report["held"]["value"] == pytest.approx(2 / 3) and report["return"]["value"] == 3
-    assert report["steps_held"]["value"] == pytest.approx(26 / 3)
-    assert (report["episodes"], report["steps"], report["starts"]) == (3, 9, 3) and report["task"] == {"ticks": 26}
-
-
-def test_a_task_that_returns_no_plain_data_is_named():
-    env = SimpleNamespace(name="mine", evaluation_steps=9, summarize=lambda metrics, lived: {"kinds": {1, 2}})
-    with pytest.raises(ConfigError, match="task 'mine': summarize must return plain data"):
-        summarize_totals(env, {"return": np.ones(3)}, np.array([9, 8, 9]), np.arange(3))
-
-
-def test_one_start_has_no_interval_to_speak_of():
-    entry = mean_interval(np.array([1.0, 1.0, 4.0]), np.zeros(3))
-    assert entry["value"] == 2.0 and entry["low"] == entry["high"] == 2.0
-    uneven = mean_interval(np.array([0.0, 0.0, 0.0, 1.0]), np.array([7, 7, 7, 9]))  # sums of starts: -3/4 and 3/4
-    assert uneven["high"] - 0.25 == pytest.approx(1.96 * np.sqrt(2 * 2 * 0.75**2) / 4)
-
-
-@pytest.mark.filterwarnings("error")
-def test_an_infinite_return_has_no_interval_and_no_warning():
-    entry = mean_interval(np.array([1.0, np.inf]), np.arange(2))
-    assert entry["value"] == np.inf and np.isnan(entry["low"]) and np.isnan(entry["high"])
-
-
 def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
     """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
     number = lambda steps: evaluate.default_episodes(SimpleNamespace(evaluation_steps=steps))  # noqa: E731
     assert [number(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [1024, 1024, 512, 384, 128, 64, 64]
-    assert evaluate.default_chunk() == 64
+    chunk = lambda **options: evaluate.chunk_of(evaluate.EvaluateArguments(policy="grasp", **options))  # noqa: E731
+    assert (chunk(), chunk(episodes=3), chunk(episodes=3, chunk=2)) == (64, 3, 2)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert number(4000) == evaluate.default_chunk() == 1024
+    assert number(4000) == chunk() == 1024
 
 
-def test_few_episodes_are_one_chunk(policy):
-    env = TinyEnv()
-    count = lambda **options: evaluate.evaluate_policy(policy, env=env, baseline=False, **options)["episodes"]  # noqa: E731
-    assert count(episodes=3) == 3 and count(episodes=3, chunk=2) == 4
+@pytree_dataclass
+class Commanded:
+    """What a film of `Commands` holds."""
+
+    command: Any
 
 
-def test_a_film_is_shown_to_a_minute(policy):
-    """Of each of the two episodes."""
+class Commands(TinyEnv):
+    """The target is what is commanded; every episode ends at step 7."""
+
+    def snapshot(self, state):
+        return Commanded(state.target)
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, terminated=state.metrics["length"] == 7)
+
+
+def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_the_end(policy):
+    """And at most a minute of each."""
+    env = Commands()
+    _, film = evaluate.Evaluator(env, 8)(policy.params, episodes=8, seed=0)
+    starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
+    shown = np.asarray(film.command).reshape(2, 6 + 5)
+    np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
     env = TinyEnv()
     env.control_period, env.evaluation_steps = 0.5, 130
     _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)
     assert film["x"].shape == (2 * 120,)
-
-
-@pytest.mark.parametrize(
-    ("frames", "quality", "size", "rate"),
-    [
-        (200, "quick", (640, 480), 10.0),  # 20 s at 10 Hz: no more pictures than there are
-        (450, "quick", (640, 480), 400 / 45),
-        (600, "quick", (640, 480), 8.0),  # 400 pictures would be 6.7 a second
-        (600, "talk", (1920, 1080), 30.0),
-    ],
-)
-def test_a_video_has_enough_pictures_to_follow(frames, quality, size, rate, monkeypatch, tmp_path):
-    made = []
-    monkeypatch.setattr(render, "render_episode", lambda *a, **options: made.append((a, options)) or a[2])
-    film, env = {"x": np.zeros((frames, 3))}, TinyEnv()
-    assert evaluate.write_video(env, film, tmp_path / "a.mp4", quality) == tmp_path / "a.mp4"
-    ((_, shown, _, fps), options) = made[0]
-    assert shown is film and fps == pytest.approx(10.0)
-    assert options == {"size": size, "rate": pytest.approx(rate)}
-    with pytest.raises(ConfigError, match="'tiny' draws nothing"):
-        evaluate.write_video(env, {}, tmp_path / "a.mp4")
 
 
 def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_path, monkeypatch):
@@ -128,7 +100,6 @@ def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_
     name = str(tmp_path / "policy.msgpack")
     for options, words in {
         ("--output", "x.mp4", "--video", "./x.mp4"): "--video .*x.mp4: is the file of --output",
-        ("--video", "film.avi"): "--video film.avi: give a file that ends in .mp4 or .gif",
         ("--output", name): f"--output {name}: is the policy",
         ("--episodes", "2000000"): "--episodes 2000000: must be between 0 and 1000000",
     }.items():
@@ -147,3 +118,20 @@ def test_the_tick_that_ends_an_episode_counts_and_none_after_it():
     np.testing.assert_array_equal(metrics["return"], [20.0, 10.0, 40.0])
     np.testing.assert_array_equal(lived, [1, 0, 4])
     np.testing.assert_array_equal(ended, [True, True, False])
+
+
+def test_intervals_are_by_start():
+    """Copies of an episode add nothing: four starts sixteen times each are four samples."""
+    entry = mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
+    assert entry["value"] == 2.5 and entry["high"] - 2.5 == pytest.approx(1.96 * np.sqrt(5 / 3) / 2)
+    values, start = np.tile([1.0, 2, 3, 4], 16), np.tile(np.arange(4), 16)
+    assert mean_interval(values, start) == pytest.approx(entry)
+    uneven = mean_interval(np.array([0.0, 0.0, 0.0, 1.0]), np.array([7, 7, 7, 9]))  # sums of starts: -3/4 and 3/4
+    assert uneven["high"] - 0.25 == pytest.approx(1.96 * np.sqrt(2 * 2 * 0.75**2) / 4)
+    terminated = np.tile(np.array([True, False, False, False]), 16)[None]
+    report = summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
+    assert report["starts"] == 4 and report["held"]["value"] == 0.75
+    assert report["held"]["low"] < 0.3 and report["held"]["high"] == 1.0
+    held = np.array([False] * 8 + [True] * 2)
+    report = summarize(TinyEnv(), {"return": held[None], "error": held[None]}, held[None], np.arange(10))
+    assert (report["held"]["low"], report["held"]["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson

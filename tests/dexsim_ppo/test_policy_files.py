@@ -1,13 +1,10 @@
 """Files: what is written is what is read, nothing damaged is read, and a policy's file is checked when it is loaded."""
 
-import hashlib
-import struct
 import subprocess
 import sys
 
 import jax
 import jax.numpy as jnp
-import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -86,9 +83,8 @@ def test_load_names_what_is_wrong(file, tmp_path):
     for path, options, word in (
         (file, {"kind": "train", "task": "grasp"}, "task 'tiny', not 'grasp'"),
         (file, {"kind": "policy"}, "'train' file, not a 'policy' file"),
-        (newer, {"kind": "train"}, "update dexsim"),
+        (newer, {"kind": "train"}, "format version 9"),
         (tmp_path / "text", {"kind": "train"}, "not a dexsim checkpoint"),
-        ("/dev/zero", {"kind": "train"}, "not a dexsim checkpoint"),
         (tmp_path / "missing", {"kind": "train"}, "cannot be read"),
         (tmp_path, {"kind": "train"}, "cannot be read"),
     ):
@@ -108,33 +104,6 @@ def test_restore_names_what_does_not_fit(file):
         checkpoint.restore(loaded, {k: v for k, v in TREE.items() if k != "x"})
 
 
-def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
-    before = file.read_bytes()
-    monkeypatch.setattr("dexsim.core.files.os.replace", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        checkpoint.save(file, kind="train", task="other", content={}, tree=TREE)
-    assert file.read_bytes() == before
-    assert [p.name for p in file.parent.iterdir()] == ["a.msgpack"]
-
-
-def test_resume_is_exact_to_the_bit(tmp_path):
-    """Five iterations equal two, a file, and three more; normalisers, keys and environments included."""
-    straight = make_train(TinyEnv(), SMALL)
-    state = straight.init(jax.random.key(5))
-    for _ in range(2):
-        state, _ = straight.step(state)
-    checkpoint.save(tmp_path / "c", kind="train", task="tiny", content={}, tree=state)
-    for _ in range(3):
-        state, _ = straight.step(state)
-    resumed = make_train(TinyEnv(), SMALL)
-    other = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"), resumed.shapes(jax.random.key(0)))
-    other = jax.tree.map(jnp.copy, other)
-    for _ in range(3):
-        other, _ = resumed.step(other)
-    equal(other, state)
-    assert resumed.step._cache_size() == 1
-
-
 # --- policies -------------------------------------------------------------------------------------------
 
 
@@ -149,38 +118,19 @@ def test_policy_round_trip(policy, tmp_path):
     assert loaded.control_rate == pytest.approx(10) and loaded.training == {"seed": 0}
 
 
-INVALID = {
-    "a rate of a gigahertz": ({"control_rate": 1e9}, "control_rate"),
-    "a rate in words": ({"control_rate": "33"}, "control_rate"),
-    "another squashing": ({"squash": "softsign"}, "squash"),
-    "fewer layers": ({"layers": 1}, "layers"),
-    "more layers": ({"layers": 3}, "layers"),
-    "a smaller layout": ({"observation_layout": [["angle", 2, None]]}, "kernel"),
-    "a memory": ({"memory": ["gru", 4]}, "kernel"),
-    "a field that does not exist": ({"colour": "red"}, "colour"),
-    "an invalid specification": ({"spec": {"name": "a", "fields": [], "posture": [1e9]}}, "posture"),
-    "a hand in words": ({"hand": {"file": 3}}, "hand"),
-}
-
-
-@pytest.mark.parametrize("what", INVALID)
-def test_an_invalid_header_is_named_in_one_line(policy, tmp_path, what):
-    changes, word = INVALID[what]
-    policy.save(path := tmp_path / "p.msgpack")
-    content = checkpoint.load(path, kind="policy").content
-    checkpoint.save(path, kind="policy", task="tiny", content=content | changes, tree=policy.params)
-    with pytest.raises(CheckpointError, match=rf"^[^\n]*{word}[^\n]*$"):
-        load_policy(path)
-
-
-@pytest.mark.parametrize(("leaf", "value"), [(".layers[0].kernel", np.nan), (".normalizer.std", 0.0)])
-def test_numbers_that_give_no_action_are_an_error(policy, tmp_path, leaf, value):
-    change = lambda path, x: jnp.full_like(x, value) if jax.tree_util.keystr(path) == leaf else x  # noqa: E731
-    tree = jax.tree_util.tree_map_with_path(change, policy.params)
-    policy.save(path := tmp_path / "p.msgpack")
-    content = checkpoint.load(path, kind="policy").content
-    checkpoint.save(path, kind="policy", task="tiny", content=content, tree=tree)
-    with pytest.raises(CheckpointError, match="not finite, or deviations"):
+@pytest.mark.parametrize(
+    ("header", "arrays", "words"),
+    [
+        ({"control_rate": 1e9}, {}, "control_rate"),
+        ({"spec": {"name": "a", "fields": [], "posture": [1e9]}}, {}, "posture"),
+        ({}, {"kernel_0": np.full((3, 8), np.nan, np.float32)}, "not finite, or deviations"),
+        ({}, {"std": np.zeros(3, np.float32)}, "not finite, or deviations"),
+    ],
+)
+def test_numbers_that_give_no_action_are_an_error(policy, tmp_path, header, arrays, words):
+    path, header, arrays = tmp_path / "p.msgpack", policy.header() | header, policy.arrays() | arrays
+    checkpoint.save(path, kind="policy", task="tiny", content=header, tree=arrays)
+    with pytest.raises(CheckpointError, match=words):
         load_policy(path)
 
 
@@ -207,16 +157,3 @@ def test_policies_load_without_the_simulator(policy, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "(1,)", done.stderr
-
-
-def test_a_header_with_a_wrong_checksum_is_found_before_it_is_read(file, tmp_path):
-    data = file.read_bytes()
-    size = struct.unpack("<Q", data[8:16])[0]
-    packed = msgpack.packb(msgpack.unpackb(data[48 : 48 + size]) | {"task": "grasp"})
-    prefix = data[:8] + struct.pack("<Q", len(packed))
-    forged = tmp_path / "forged"
-    forged.write_bytes(prefix + data[16:48] + packed + data[48 + size :])
-    with pytest.raises(CheckpointError, match="header's checksum"):
-        checkpoint.load(forged, kind="train")
-    forged.write_bytes(prefix + hashlib.sha256(prefix + packed).digest() + packed + data[48 + size :])
-    assert checkpoint.load(forged, kind="train").task == "grasp"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import dexsim
-from dexsim import registry
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.env.evaluation import evaluation_of
@@ -55,13 +54,10 @@ def test_an_episode_ends_with_its_drop(env):
     assert max(lengths) < round(4.0 / env.control_period), "a hand that does nothing drops the object"
 
 
-def test_it_must_be_told_what_to_write():
+def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
+    monkeypatch.setattr(record, "record", lambda *_, **__: pytest.fail("it went on"))
     with pytest.raises(ConfigError, match="--lerobot FOLDER or --rrd FILE"):
         record.main(["grasp"])
-
-
-def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
-    monkeypatch.setattr(record, "find_task", lambda *_, **__: pytest.fail("it went on"))
     (tmp_path / "folder").mkdir()
     with pytest.raises(DexsimError, match="folder: exists already"):
         record.main(["grasp", "--lerobot", str(tmp_path / "folder")])
@@ -71,12 +67,3 @@ def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypa
     monkeypatch.setitem(sys.modules, "rerun", types.ModuleType("rerun"))
     with pytest.raises(IsADirectoryError):
         record.main(["grasp", "--rrd", str(tmp_path / "folder")])
-
-
-def test_an_environment_from_elsewhere_has_nothing_to_record(monkeypatch, tmp_path):
-    pytest.importorskip("pyarrow")
-    policy = dataclasses.replace(load_policy("grasp"), task="elsewhere")
-    monkeypatch.setitem(registry.TASKS, "elsewhere", dataclasses.replace(registry.TASKS["grasp"], environment=object))
-    policy.save(tmp_path / "policy.msgpack")
-    with pytest.raises(ConfigError, match="'elsewhere' is no task on a hand"):
-        record.main([str(tmp_path / "policy.msgpack"), "--lerobot", str(tmp_path / "data")])

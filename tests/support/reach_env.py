@@ -28,31 +28,3 @@ class Reach:
 
 def reach():
     return Reach()
-
-
-def needs_a_size(size):
-    return Reach()
-
-
-class Broken(Reach):
-    def step(self, key, state, action):
-        return super().step(key, state, action)[:3]
-
-
-class Breaks(Reach):
-    """Observes NaN from the fourth step of an episode on."""
-
-    def step(self, key, state, action):
-        seen, state, reward, terminated = super().step(key, state, action)
-        return jnp.where(state["steps"] > 3, jnp.nan, seen), state, reward, terminated
-
-
-def breaks():
-    return Breaks()
-
-
-def grasp():
-    return Reach()
-
-
-NUMBER = 3

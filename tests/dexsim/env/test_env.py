@@ -163,9 +163,9 @@ class TestTick:
             for substep in range(config.physics.substeps):
                 acting = new + np.clip(latency - substep, 0, 1) * (old - new)
 
-                def motors(q, v, acting=acting, drive=drive):
+                def motors(q, v, acting=acting, drive=drive, rate=inertia_rate):
                     torque = plain_drive(drive, acting, q, v)
-                    return torque - plain_friction(drive, torque, v, inertia_rate)
+                    return torque - plain_friction(drive, torque, v, rate)
 
                 # The motors' damping acts at the middle of the step: half of its slope, by differences, is inertia.
                 q, v, h = data.qpos[:12].copy(), data.qvel[:12].copy(), model.opt.timestep

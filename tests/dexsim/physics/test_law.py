@@ -42,7 +42,8 @@ def in_cpp(recorded, constants, folder):
     printed = print_law(recorded, JOINTS)
     pointers = "".join(f"const {buffer.ctype} *{buffer.name};" for buffer in printed.buffers)
     source, library = folder / "law.cpp", folder / "law.so"
-    text = f"#include <cmath>\n#define DEV static\nstruct Args {{ {pointers} }};\nstruct Motor {{ float torque, inertia; }};\n{printed.text}{MAIN}"
+    structs = f"struct Args {{ {pointers} }};\nstruct Motor {{ float torque, inertia; }};\n"
+    text = f"#include <cmath>\n#define DEV static\n{structs}{printed.text}{MAIN}"
     source.write_text(text)
     subprocess.run(["g++", "-O2", "-ffp-contract=off", "-shared", "-fPIC", "-o", library, source], check=True)
     call = ctypes.CDLL(str(library)).run
@@ -51,7 +52,9 @@ def in_cpp(recorded, constants, folder):
     def run(substep, position, velocity):
         torque, inertia = np.zeros((2, *position.shape), np.float32)
         addresses = (ctypes.c_void_p * len(constants))(*(constant.ctypes.data for constant in constants))
-        arrays = (np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (position, velocity, torque, inertia))
+        arrays = (
+            np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (position, velocity, torque, inertia)
+        )
         call(addresses, *position.shape, substep, *arrays)
         return torque, inertia
 
@@ -139,7 +142,10 @@ TABLE, WIDE, MATRIX = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS)
     [
         (lambda index, *_: (TABLE[index], OFFSET), "a motor law with .*choose backend mjx"),
         (lambda index, p, v: (MATRIX @ p, v), "dot_general"),
-        (lambda index, p, v: (jnp.broadcast_to(p, WIDE.shape) + WIDE, v), r"an array \[2, 12\] float32: expected \[\] or"),
+        (
+            lambda index, p, v: (jnp.broadcast_to(p, WIDE.shape) + WIDE, v),
+            r"an array \[2, 12\] float32: expected \[\] or",
+        ),
     ],
 )
 def test_laws_that_are_not_element_by_element_are_named(law, message):

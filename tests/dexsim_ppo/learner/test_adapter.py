@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import subprocess
 import sys
 
@@ -15,10 +14,9 @@ from reach_env import MAX_STEPS, Reach
 from tiny_env import SMALL
 
 from dexsim import registry
-from dexsim.errors import ConfigError, DexsimError
-from dexsim.tasks.grasp.config import GraspConfig
-from dexsim_ppo import CurriculumConfig, evaluate_policy, load_policy, make_train, reproduce, train_policy
+from dexsim.errors import ConfigError
 from dexsim_ppo import evaluate as evaluate_command
+from dexsim_ppo import evaluate_policy, load_policy, make_train, train_policy
 from dexsim_ppo.learner.adapter import adapt
 
 
@@ -64,18 +62,13 @@ def test_the_time_limit_truncates_and_a_terminal_state_terminates():
     assert ended.terminated and not ended.truncated
 
 
-def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
+def test_restart_is_a_new_episode_where_asked():
     env = adapt(Reach(), "reach")
     state = play(env, [0.3, 0.3])[-1]
     same, fresh = (jax.jit(env.restart)(state, jnp.bool_(done)) for done in (False, True))
-    np.testing.assert_array_equal(same.inner["x"], state.inner["x"])
-    assert fresh.inner["x"] != state.inner["x"] and fresh.clock == 0 and fresh.metrics["length"] == 0
-    again = jax.jit(env.restart)(same, jnp.bool_(True))
-    assert again.inner["x"] != fresh.inner["x"]
-    clocks = jax.vmap(lambda key: env.randomize_episode_time(state, key).clock)(
-        jax.random.split(jax.random.key(1), 200)
-    )
-    assert set(np.asarray(clocks).tolist()) == set(range(MAX_STEPS))
+    assert same.inner["x"] == state.inner["x"] != fresh.inner["x"]
+    assert fresh.clock == 0 and fresh.metrics["length"] == 0 and same.clock == 2
+    assert jax.jit(env.restart)(same, jnp.bool_(True)).inner["x"] != fresh.inner["x"], "keys advance either way"
 
 
 def test_make_train_adapts_and_leaves_complete_environments_alone():
@@ -84,26 +77,6 @@ def test_make_train_adapts_and_leaves_complete_environments_alone():
     assert int(state.iteration) == 1 and np.isfinite(metrics["step/distance"]).all()
     env = adapt(Reach(), "reach")
     assert adapt(env, "other") is env and adapt(Reach()).name == "Reach"
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"observation_size": 3}, r"observation must have the shape \(3,\), got \(2,\)"),
-        ({"action_size": 0}, "expected action_size to be a whole number of at least 1, got 0"),
-        ({"max_steps": 2.0}, "max_steps .* got 2.0"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(1), jnp.bool_(False))}, r"reward must have the shape"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(()), jnp.zeros(()))}, "terminated must be bool"),
-        ({"step": lambda k, s, a: (jnp.zeros(2), s["x"], jnp.zeros(()), jnp.bool_(False))}, "of the form of reset's"),
-    ],
-)
-def test_what_does_not_fit_is_one_line(change, message):
-    env = Reach()
-    for name, value in change.items():
-        setattr(env, name, value)
-    with pytest.raises(ConfigError, match=message) as error:
-        adapt(env, "reach")
-    assert "'reach'" in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
         adapt({}, "nothing")
 
@@ -111,40 +84,6 @@ def test_what_does_not_fit_is_one_line(change, message):
 def test_float64_is_an_error_before_anything_is_compiled():
     with jax.enable_x64(True), pytest.raises(ConfigError, match="unset JAX_ENABLE_X64"):
         make_train(Reach(), SMALL)
-
-
-@pytest.mark.parametrize(
-    "name, message",
-    [
-        ("no_such_module:make", "cannot be imported"),
-        ("reach_env:nothing", "unknown task 'nothing'"),
-        ("reach_env:needs_a_size", "callable without arguments"),
-        ("reach_env:grasp", "dexsim has a task 'grasp' of its own"),
-    ],
-)
-def test_bad_names_are_one_line(name, message):
-    with pytest.raises(ConfigError, match=message):
-        train_policy(name, ppo=SMALL, steps=64)
-
-
-def test_settings_that_it_does_not_have_are_errors(tmp_path):
-    for config, options, message in (
-        (GraspConfig(), {}, "takes no config"),
-        (None, {"curriculum": CurriculumConfig(on=True)}, "no ranges that could widen"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            train_policy("reach_env:reach", config, ppo=SMALL, steps=64, run_dir=tmp_path / "run", **options)
-        assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_fault_is_replayed(tmp_path, capsys):
-    sizes = {"evaluation_chunk": 8, "evaluation_episodes": 8}
-    with pytest.raises(DexsimError, match="training diverged.* --task reach_env:breaks$"):
-        train_policy("reach_env:breaks", ppo=SMALL, steps=1e5, run_dir=tmp_path / "run", **sizes)
-    file = sorted((tmp_path / "run").glob("reproduce-*.msgpack"))[0]
-    assert reproduce.main([str(file), "--task", "reach_env:breaks"]) == 0
-    assert re.search(r"'observation': \d+ of \d+ environments .*, first at step", capsys.readouterr().out)
 
 
 @pytest.mark.slow
@@ -166,60 +105,6 @@ def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, caps
         + ["--seed", "3", "--output", str(tmp_path / "report.json")]
     )
     assert code == 0 and f"{report['return']['value']:.4g}" in capsys.readouterr().out
-
-
-class Params:
-    """As gymnax's: a frozen record with `replace`."""
-
-    def __init__(self, max_steps_in_episode=200):
-        self.max_steps_in_episode = max_steps_in_episode
-
-    def replace(self, **changes):
-        return Params(**changes)
-
-
-class Box:
-    def __init__(self, low, high, shape):
-        self.low, self.high, self.shape = low, high, shape
-
-
-class GymnaxPendulum:
-    """gymnax's functions for a pendulum in a few lines, its time limit inside."""
-
-    def observation_space(self, params):
-        return Box(-jnp.ones(3), jnp.ones(3), (3,))
-
-    def action_space(self, params):
-        return Box(-2.0, 2.0, (1,))
-
-    def reset_env(self, key, params):
-        theta, speed = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
-        state = {"theta": theta, "speed": speed, "time": jnp.int32(0)}
-        return self._seen(state), state
-
-    def step_env(self, key, state, action, params):
-        cost = state["theta"] ** 2 + 0.1 * state["speed"] ** 2 + 0.001 * action**2
-        speed = state["speed"] + 0.05 * (15.0 * jnp.sin(state["theta"]) + 3.0 * action[0])
-        state = {"theta": state["theta"] + 0.05 * speed, "speed": speed, "time": state["time"] + 1}
-        done = state["time"] >= params.max_steps_in_episode
-        return self._seen(state), state, -cost, done, {"discount": 1.0}
-
-    def _seen(self, state):
-        return jnp.stack([jnp.cos(state["theta"]), jnp.sin(state["theta"]), state["speed"]])
-
-
-@pytest.mark.slow
-def test_the_docs_adapter_fits_gymnax():
-    page = (ROOT / "docs" / "any_environment.md").read_text()
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FromGymnax" in block)
-    names = {}
-    exec(compile(code, "docs/any_environment.md", "exec"), names)
-    env = adapt(names["FromGymnax"](GymnaxPendulum(), Params(max_steps_in_episode=5)), "pendulum")
-    states = play(env, [1.0] * 5)
-    assert [bool(s.truncated) for s in states] == [False] * 5 + [True] and not states[-1].terminated
-    # A full action is a torque of 2.
-    begun, after = states[0].inner, states[1].inner
-    assert after["speed"] - begun["speed"] == pytest.approx(0.05 * (15 * np.sin(begun["theta"]) + 6.0), rel=1e-4)
 
 
 def test_the_learner_needs_no_hand():

@@ -34,7 +34,6 @@ CONFIG = dataclasses.replace(
     bounds_coefficient=0.4,
     discount=0.9,
     gae_lambda=0.8,
-    reward_scale=0.6,
     observation_clip=1.2,
     observation_std_floor=0.3,
 )
@@ -91,8 +90,7 @@ def setting(seed, **options):
     params = jax.tree.map(jnp.add, params, change(0.4))
     single = lambda *x: RunningStats(jnp.int32(30), *(jnp.asarray(v, jnp.float32) for v in x))  # noqa: E731
     stats = {g: single(rng.normal(size=4), rng.uniform(0.2, 3, 4)) for g in Script.observation_layout}
-    value = single(0.7, 9.0) if config.normalize_value else single(0.0, 1.0 - 1e-6)
-    return Script(rng), config, params, stats, value, change(0.15)
+    return Script(rng), config, params, stats, single(0.7, 16.0), change(0.15)
 
 
 def experience(script, config, params, stats, value_stats, key):
@@ -157,7 +155,7 @@ class Reference:
         return x
 
     def value(self, params, obs):
-        """In units of scaled rewards, by the statistics that the critic has learnt with."""
+        """In reward units, by the statistics that the critic has learnt with."""
         return self.mean + self.std * self.network(params.critic, self.seen("critic", obs))[0]
 
     def advantages(self, script):
@@ -169,8 +167,7 @@ class Reference:
                 obs, after = ({g: v[t, row] for g, v in script.obs.items()} for t in (time, time + 1))
                 terminated, truncated = script.terminated[time, row], script.truncated[time, row]
                 value, following = (self.value(self.old, o["critic"]) for o in (obs, after))
-                reward = c.reward_scale * script.reward[time, row]
-                delta = reward + (0.0 if terminated else c.discount * following) - value
+                delta = script.reward[time, row] + (0.0 if terminated else c.discount * following) - value
                 chain.append((delta, terminated or truncated))
                 mean = self.network(self.old.actor, self.seen("actor", obs["actor"]))
                 samples.append({"obs": obs, "action": self.actions[tick, row], "mean": mean, "value": value})
@@ -186,16 +183,14 @@ class Reference:
         advantages, targets = (np.array([s[name] for s in samples]) for name in ("advantage", "target"))
         for sample in samples:
             sample["advantage"] = (sample["advantage"] - advantages.mean()) / advantages.std()
-        self.new_mean, self.new_std = self.mean, self.std
-        if c.normalize_value:  # Of all targets so far, these among them.
-            size = self.count + len(targets)
-            self.new_mean = (self.count * self.mean + targets.sum()) / size
-            squares = self.count * (self.std**2 - 1e-6 + self.mean**2) + np.sum(targets**2)
-            self.new_std = math.sqrt(squares / size - self.new_mean**2 + 1e-6)
+        size = self.count + len(targets)  # Of all targets so far, these among them.
+        self.new_mean = (self.count * self.mean + targets.sum()) / size
+        squares = self.count * (self.std**2 - 1e-6 + self.mean**2) + np.sum(targets**2)
+        self.new_std = math.sqrt(squares / size - self.new_mean**2 + 1e-6)
         return samples
 
     def __call__(self, params):
-        c, surrogate, value_loss, bounds, squashing = self.config, 0.0, 0.0, 0.0, 0.0
+        c, surrogate, value_loss, bounds = self.config, 0.0, 0.0, 0.0
         old_std, std = np.exp(self.old.log_std), np.exp(params.log_std)
         for s in self.samples:
             mean = self.network(params.actor, self.seen("actor", s["obs"]["actor"]))
@@ -213,12 +208,8 @@ class Reference:
             value_loss += 0.5 * max(errors)
             for k in range(ACTIONS):
                 bounds += max(abs(mean[k]) - 1.1, 0.0) ** 2
-                x = mean[k] + std[k] * (s["action"][k] - s["mean"][k]) / old_std[k]
-                squashing += math.log(1 - math.tanh(x) ** 2)
         count = len(self.samples)
         entropy = sum(math.log(s) + 0.5 * math.log(2 * math.pi * math.e) for s in std)
-        if c.distribution == "tanh":
-            entropy, bounds = entropy + squashing / count, 0.0
         total = -surrogate + c.value_coefficient * value_loss + c.bounds_coefficient * bounds
         return total / count - c.entropy_coefficient * entropy
 
@@ -233,11 +224,7 @@ class Reference:
         return total / len(self.samples)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"distribution": "tanh"}, {"normalize_value": False, "value_clip": 0.0}],
-    ids=["gaussian", "tanh", "plain values"],
-)
+@pytest.mark.parametrize("options", [{}, {"value_clip": 0.0}], ids=["clipped values", "plain values"])
 def test_objective_and_gradient_from_raw_experience(options):
     """The value before and after a step of the update; the gradient along random directions of all parameters."""
     script, config, params, stats, value_stats, step = setting(3, **options)

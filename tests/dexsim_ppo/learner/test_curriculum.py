@@ -10,7 +10,6 @@ from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
 
@@ -101,27 +100,3 @@ def test_success_may_be_a_metric_by_name():
     assert float(scale) == pytest.approx(0.6) and float(success) == 7
     with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
         update_scale(dataclasses.replace(rules, metric="step/luck"), scale, metrics)
-
-
-def test_off_it_is_not_there():
-    """Neither in the state, nor in the metrics, nor at the environment's door (`TinyEnv.reset` knows no scale)."""
-    training = make_train(TinyEnv(), SMALL, CurriculumConfig())
-    state = training.init(jax.random.key(0))
-    assert state.scale is None
-    assert not any("curriculum" in name for name in training.step(state)[1])
-
-
-def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
-    training = make_train(WideEnv(), SMALL, RULES)
-    state = training.init(jax.random.key(0))
-    for _ in range(2):
-        state, _ = training.step(state)
-    checkpoint.save(tmp_path / "c", kind="train", task="tiny", content={}, tree=state)
-    straight, _ = training.step(state)
-    resumed = make_train(WideEnv(), SMALL, RULES)
-    again = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"), resumed.shapes(jax.random.key(5)))
-    assert float(again.scale) == pytest.approx(0.7)
-    again, _ = resumed.step(jax.tree.map(jnp.copy, again))
-    for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):
-        if not jnp.issubdtype(ours.dtype, jax.dtypes.prng_key):
-            np.testing.assert_array_equal(ours, theirs)

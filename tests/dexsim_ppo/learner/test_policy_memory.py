@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from recall_env import CONFIG, Recall
 
-from dexsim.core.errors import ConfigError
 from dexsim_ppo.evaluate import evaluate_policy
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import actor_mean, critic_value
 from dexsim_ppo.learner.memory import GRU, step_memory
 from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config, initialize_from
+from dexsim_ppo.policy import Policy
 
 
 @functools.cache
@@ -82,17 +79,6 @@ def test_every_episode_begins_with_an_empty_memory_and_only_then():
     assert np.abs(later[~ended]).max(-1).min() > 0
 
 
-def test_the_value_after_a_step_is_that_of_the_true_next_observation():
-    """With what was remembered then, at an episode's end too: there the observation is zero, not that of a start."""
-    env, config, state = trained("gru")
-    _, rollout, *_ = experience("gru")
-    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    memory = jax.vmap(lambda memory, obs: policy_of("gru")[1].act(memory, obs)[0])(rollout.carry, rollout.obs["actor"])
-    value = critic_value(config, state.params, normalizers, {"critic": jnp.zeros_like(rollout.obs["critic"])}, memory)
-    std = np.sqrt(state.value_stats.variance + 1e-6)
-    np.testing.assert_allclose(rollout.next_value, state.value_stats.mean + std * value, atol=1e-4)
-
-
 def test_a_gated_recurrent_unit_is_that_of_its_equations():
     """Unit by unit, in double precision."""
     rng, n, units = np.random.default_rng(0), 3, 4
@@ -127,35 +113,3 @@ def test_gradients_go_back_through_the_rollout():
     for first, reaches in ((begun, [True] * 4), (begun.at[:, 2].set(True), [False, False, True, True])):
         slope = np.abs(jax.grad(last)(jnp.asarray(samples.obs["actor"]), first)).sum((0, 2))
         assert ((slope > 1e-6) == reaches).all(), slope
-
-
-def test_minibatches_of_a_gru_are_whole_rollouts():
-    assert PPOConfig(memory="gru", num_envs=8, minibatches=8).rows == 8
-    with pytest.raises(ConfigError, match="must divide PPOConfig.num_envs, which is 8"):
-        PPOConfig(memory="gru", num_envs=8, minibatches=16)
-
-
-def test_a_file_holds_the_memory(tmp_path):
-    _, policy = policy_of("gru")
-    policy.save(tmp_path / "policy.msgpack")
-    again = load_policy(tmp_path / "policy.msgpack")
-    obs = np.random.default_rng(0).normal(size=(5, 7, 2)).astype(np.float32)
-    one, other = policy.initial_carry(7), again.initial_carry(7)
-    for x in obs:
-        (one, action), (other, same) = policy.act(one, x), again.act(other, x)
-        np.testing.assert_array_equal(action, same)
-    assert again.initial_carry().shape == one.shape[1:] and np.abs(one).max() > 0
-
-
-def test_fine_tuning_begins_with_it():
-    env, policy = policy_of("gru")
-    config = fine_tuning_config(policy, dataclasses.replace(CONFIG, memory_size=3))
-    check_fit(policy, env, config)
-    state = initialize_from(policy, config, ppo.make_train(env, config).init(jax.random.key(9)))
-    again = Policy.from_training(env, config, state)
-    memory = jax.random.normal(jax.random.key(3), policy.initial_carry(5).shape)
-    obs = jnp.ones((5, 2))
-    for one, other in zip(policy.act(memory, obs), again.act(memory, obs), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-5)
-    with pytest.raises(ConfigError, match="PPOConfig.memory = none: the policy has gru"):
-        check_fit(policy, env, dataclasses.replace(config, memory="none"))

@@ -1,18 +1,16 @@
 """Two trainings from one seed are the same to the last bit: on a CPU always, on a GPU with `--deterministic`."""
 
-import json
 import subprocess
 import sys
 
 import jax
 import numpy as np
 import pytest
-import tiny_train
 from paths import ROOT
 
 import dexsim
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim_ppo import checkpoint, train
+from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.runlog import RunFolder
@@ -48,16 +46,6 @@ def test_training_on_c_repeats_to_the_bit():
 
     assert not unequal(train_from(0), train_from(0))
     assert unequal(train_from(0), train_from(1)), "else the comparison sees nothing"
-
-
-def test_the_option_is_kept_and_on_a_cpu_says_that_it_changes_nothing(monkeypatch, tmp_path, capsys):
-    tiny_train.install(monkeypatch)
-    sizes = "--ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8 --ppo.critic-layers 8 --steps 128".split()
-    sizes += "--evaluation-chunk 16 --evaluation-episodes 16 --no-video --preset cpu".split()
-    folder = RunFolder(tmp_path / "a")
-    assert train.main(["--task", "tiny", "--deterministic", *sizes, "--run-dir", str(folder.path)]) == 0
-    assert "--deterministic changes nothing here" in capsys.readouterr().out
-    assert json.loads(folder.config.read_text())["arguments"]["deterministic"] is True
 
 
 @pytest.mark.gpu

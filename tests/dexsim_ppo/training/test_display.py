@@ -67,46 +67,9 @@ def test_at_80_columns_nothing_is_cut_or_folded(shown):
     assert len(lines) <= 12
 
 
-def test_the_bar_is_as_long_as_the_share_of_time(shown):
-    long = [shown([ROW | {"seconds": s, "seconds_left": 100.0 - s}])[0][1].count("━") for s in (10.0, 50.0, 90.0)]
-    assert long == [4, 20, 36]
-
-
 def test_without_a_budget_there_is_no_bar(shown):
     lines, _ = shown([ROW | {"seconds_left": float("inf")}])
     assert "elapsed 4:31" in lines[1] and not any("━" in line or "left" in line for line in lines)
-
-
-def test_the_sparkline_follows_the_returns(shown):
-    assert display.sparkline([0.0, 1.0, 7.0, 3.5]) == "▁▂█▅"
-    assert display.sparkline([2.0, 2.0]) == "▁▁"
-    lines, _ = shown([ROW | {"episode/return": float(k)} for k in range(8)])
-    assert "▁▂▃▄▅▆▇█" in "".join(lines)
-
-
-def test_what_is_compiled_is_said_until_the_first_row(shown):
-    lines, out = shown([])
-    assert "compiling the training step" in " ".join(lines)
-    plain, _ = shown([ROW], terminal=False)
-    assert plain[0] == "compiling the training step" and plain[1].startswith("iteration 1180 | steps 4.83M")
-
-
-def test_what_no_episode_has_told_keeps_its_last_value(shown):
-    lines, _ = shown([ROW, ROW | {"episode/return": float("nan"), "kl": 0.5}], terminal=False)
-    assert "return 184.24" in lines[-1] and "KL 0.5000" in lines[-1]
-    assert "rate" not in lines[-1] and "skipped updates 2 of 2360" in lines[-1]
-
-
-def test_the_sparkline_is_of_the_last_eighteen_returns(shown):
-    lines, _ = shown([ROW | {"episode/return": float(k)} for k in range(30)])
-    bars = [letter for letter in "".join(lines) if letter in "▁▂▃▄▅▆▇█"]
-    assert len(bars) == 18 and bars[0] == "▁" and bars[-1] == "█"
-
-
-def test_numbers_are_short():
-    assert [display.count(x) for x in (0, 999, 1000, 12345, 1e6, 2.5e9)] == ["0", "999", "1k", "12.3k", "1M", "2.5G"]
-    seconds = (0, 59.4, 59.6, 75, 3600, -3, float("inf"), float("nan"))
-    assert [display.duration(s) for s in seconds] == ["0:00", "0:59", "1:00", "1:15", "60:00", "0:00", "-", "-"]
 
 
 def test_all_but_the_first_process_are_quiet(capsys):

@@ -119,7 +119,10 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
     for arguments, said in (
         (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
         (["--policy", "nothing.msgpack"], "cannot be read"),
-        (["--policy", "other.msgpack"], "observations of policy and environment differ"),
+        (
+            ["--policy", "other.msgpack"],
+            "the policy expects position_2 [1]",
+        ),
         (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "--ppo.actor-layers (7,): the policy has"),
         (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "--ppo.memory gru: the policy has none"),
     ):

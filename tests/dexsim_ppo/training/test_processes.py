@@ -1,16 +1,9 @@
 """What one process of several does and does not, with the others made up."""
 
-import os
-from pathlib import Path
-from types import SimpleNamespace
-
 import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from dexsim.core.errors import DexsimError
-from dexsim_ppo import checkpoint
 from dexsim_ppo.training import processes
 
 
@@ -23,42 +16,6 @@ def several(monkeypatch):
         monkeypatch.setattr(jax, "process_index", lambda: index)
 
     return be
-
-
-def test_alone_it_asks_nobody_and_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "multihost_utils", None)
-    assert processes.is_first() and processes.agree(7) == 7
-    assert processes.agree_on_path(tmp_path) is tmp_path
-
-
-def test_all_stop_when_one_does(several, monkeypatch):
-    several(2)
-    others = SimpleNamespace(process_allgather=lambda mine: np.array([0, 15, int(mine)]))
-    monkeypatch.setattr(processes, "multihost_utils", others)
-    assert processes.agree(2) == 15 and processes.agree(99) == 99 and processes.agree(False) == 15
-    assert not processes.is_first()
-
-
-@pytest.mark.parametrize("path", ["runs/a", "/tmp/größe und mehr", "x" * 3000])
-def test_the_path_is_that_of_the_first_process(path, several, monkeypatch):
-    several(0)
-    sent = []
-    monkeypatch.setattr(
-        processes, "multihost_utils", SimpleNamespace(broadcast_one_to_all=lambda x: sent.append(x) or x)
-    )
-    assert processes.agree_on_path(Path(path)) == Path(path)
-    assert sent[0].shape == (4096,), "of one size in every process"
-
-
-def test_a_checkpoint_is_gathered_by_all_and_written_by_the_first(several, monkeypatch, tmp_path):
-    gathered, written = [], []
-    monkeypatch.setattr(processes, "mesh_of", lambda tree: "mesh")
-    monkeypatch.setattr(processes, "copied", lambda tree, mesh: gathered.append(mesh) or tree)
-    monkeypatch.setattr(checkpoint, "save", lambda path, **content: written.append((path, content["task"])))
-    for index in range(3):
-        several(index)
-        processes.save(tmp_path / "c", tree={"x": jnp.zeros(index + 1)}, kind="train", task="tiny", content={})
-    assert gathered == ["mesh"] * 3 and written == [(tmp_path / "c", "tiny")]
 
 
 @pytest.mark.parametrize("job", ["SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX", None])
@@ -102,19 +59,3 @@ def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, 
             fail(text)
     with pytest.raises(ValueError, match="shapes"):
         fail("shapes do not match")
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [(DexsimError("a\nline"), "error: a line\n"), (ZeroDivisionError("why"), "ZeroDivisionError: why")],
-)
-def test_a_process_of_several_ends_at_once(error, said, monkeypatch, capsys):
-    with pytest.raises(type(error)), processes.exit_on_error():
-        raise error
-    ended = []
-    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(os, "_exit", ended.append)
-    with processes.exit_on_error():
-        raise error
-    assert ended == [2]
-    assert said in capsys.readouterr().err

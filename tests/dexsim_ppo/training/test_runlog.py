@@ -1,16 +1,14 @@
-"""Where metrics go, and that the learning curve says what it shows, in words and units."""
+"""Where metrics go, and which files of a run stay."""
 
 import json
 import sys
-import threading
 import types
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import pytest
 from tiny_env import SMALL, TinyConfig
 
-from dexsim.core.errors import CheckpointError, DexsimError
+from dexsim.core.errors import CheckpointError
 from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
@@ -19,52 +17,6 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
-
-
-@pytest.fixture
-def figure(tmp_path, monkeypatch):
-    """The figure of rows of metrics."""
-    drawn = []
-    monkeypatch.setattr(plt, "close", drawn.append)
-
-    def draw(rows):
-        runlog.draw_curve([rows], tmp_path / "curve.png", "grasp")
-        return drawn[-1] if drawn else None
-
-    return draw
-
-
-def row(iteration, **more):
-    steps = 500_000 * iteration
-    return {"iteration": iteration, "env_steps": steps, "seconds": 60.0 * iteration, "episode/return": iteration} | more
-
-
-def test_axes_have_words_and_units(figure):
-    rows = [row(i, **{"step/force_error": 1.0, "episode/success": 0.5, "step/own_error": 2.0}) for i in (1, 2, 3)]
-    axes = figure(rows).axes
-    words = [" ".join(axis.get_ylabel().split()) for axis in axes]
-    assert words == ["return of an episode", "success [share of episodes]", "force error [N]"]
-    assert axes[-1].get_xlabel() == "environment steps [million]"
-    assert not any("/" in word or "_" in word for word in words)
-    assert list(axes[0].lines[0].get_xdata()) == [0.5, 1.0, 1.5]
-
-
-def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
-    axes = figure([row(1, **{"step/own_error": 2.0}), row(2, **{"evaluation/return": 7.0})]).axes
-    assert axes[1].get_ylabel() == "own error\nof a tick"
-    (mark,) = [line for line in axes[0].lines if line.get_label() == "evaluation"]
-    assert list(mark.get_ydata()) == [7.0]
-
-
-def test_a_curve_of_several_seeds_has_a_line_for_each(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(plt, "close", drawn.append)
-    runlog.draw_curve([[row(1), row(2)], [row(1), row(2), row(3)]], tmp_path / "curve.png", "grasp")
-    assert [len(line.get_xdata()) for line in drawn[0].axes[0].lines] == [2, 3]
-
-
-def test_nothing_to_show_draws_nothing(figure):
-    assert figure([{"iteration": 1, "env_steps": 1}]) is None
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -113,18 +65,6 @@ def test_what_is_set_aside_is_never_replaced(tmp_path):
     assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
 
 
-def test_a_full_disk_does_not_cost_the_metrics_so_far(tmp_path, monkeypatch):
-    def full(handle):
-        raise OSError(28, "No space left on device")
-
-    folder = RunFolder(tmp_path)
-    folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4)))
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        MetricsLog(folder, 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
-    assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4]
-
-
 def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path):
     file = RunFolder(tmp_path).metrics
     file.write_text(content := '{"iteration": 2}\n{"iterat\n{"iteration": 4}\n')
@@ -161,32 +101,6 @@ def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
     assert writer.closed
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_tensorboard_on_a_full_disk_does_not_stop_the_log(tmp_path, monkeypatch):
-    record_writer = pytest.importorskip("tensorboardX.record_writer").RecordWriter
-    write_record, written = record_writer.write, []
-
-    def filling(self, data):
-        written.append(data)
-        if len(written) > 5:
-            raise OSError(28, "No space left on device")
-        write_record(self, data)
-
-    monkeypatch.setattr(record_writer, "write", filling)
-    folder = RunFolder(tmp_path)
-
-    def write():
-        log = MetricsLog(folder, 0, TrainArguments(env=TinyConfig(), ppo=SMALL))
-        for i in range(1, 101):
-            log.write({"iteration": i, "env_steps": i, "kl": 0.5})
-        log.close()
-
-    thread = threading.Thread(target=write, daemon=True)
-    thread.start()
-    thread.join(30)
-    assert not thread.is_alive() and len(read_metrics(folder.metrics)) == 100
-
-
 def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
     said = []
     run = types.SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
@@ -199,10 +113,3 @@ def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
     assert logged == [({"reward": 0.5}, 500), "finished"]
-
-
-def test_weights_and_biases_are_asked_for_before_training_begins(monkeypatch):
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    runlog.check_wandb("")
-    with pytest.raises(DexsimError, match=r"--wandb hands needs wandb: .*\[wandb\]"):
-        runlog.check_wandb("hands")

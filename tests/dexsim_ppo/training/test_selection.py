@@ -1,5 +1,6 @@
 """Evaluations during training: when they happen, which policy they choose, and when they end a training."""
 
+import copy
 import dataclasses
 import time
 import types
@@ -7,7 +8,6 @@ import types
 import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
-from dexsim.core.errors import ConfigError
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder
@@ -75,11 +75,27 @@ def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
     )  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
 
 
-def test_patience_needs_evaluations():
-    with pytest.raises(ConfigError, match=r"TrainArguments\.patience = 2: needs evaluations"):
-        dataclasses.replace(ARGUMENTS, evaluate_every=0)
-
-
 def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
     nan = float("nan")
     assert evaluate(run, monkeypatch, nan, 3.0, nan, 2.0, 4.0) == [0, 1, 4]
+
+
+@pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
+def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monkeypatch):
+    """Not of training's corners; and Warp's buffers are of the batch's size."""
+    import dexsim
+
+    made = []
+    monkeypatch.setattr(dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv(), raising=False)
+    env = TinyEnv()
+    env.backend, env.hand = backend, "the hand"
+    arguments = dataclasses.replace(ARGUMENTS, evaluation_chunk=6)
+    if own and backend == "jax":
+        monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
+    run = Run(env, arguments, RunFolder(tmp_path), 0.0)
+    if own:
+        options = {"backend": backend, "num_envs": 6, "hand": "the hand"}
+        assert made == [(("tiny", arguments.env), options)] and run.evaluator.env is not env
+    else:
+        assert not made and run.evaluator.env is env
+    assert run.evaluator.chunk == 6
