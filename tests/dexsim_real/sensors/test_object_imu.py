@@ -128,12 +128,3 @@ def test_quaternions_agree_with_the_library():
     a, b = rng.normal(size=(2, 4))
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     np.testing.assert_allclose(imu.multiply(a, b), jax.jit(rotations.quat_multiply)(a, b), atol=1e-6)
-
-
-@given(turns)
-def test_alignment_gives_gravity_in_the_palm_frame(palm):
-    """`palm` turns the palm frame into the IMU's world, whose z is up."""
-    reader = imu.ImuReader()
-    reader._newest = 0.0, imu.multiply(np.roll(palm.as_quat(), 1), reader._mount)
-    reader.calibrate(IDENTITY)
-    np.testing.assert_allclose(reader.palm_gravity, palm.inv().apply([0.0, 0.0, -1.0]), atol=1e-6)
