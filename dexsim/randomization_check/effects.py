@@ -149,7 +149,7 @@ def changes(before: Any, after: Any) -> tuple[str, ...]:
 
 
 def _is_range(name: str, value: Any) -> bool:
-    pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, float) for v in value)
+    pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, int | float) for v in value)
     return pair or name in _DEVIATIONS and isinstance(value, float)
 
 
