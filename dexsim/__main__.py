@@ -23,7 +23,7 @@ COMMANDS = {
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
-    "randomization-check": ("dexsim.randomization_check", "test that every range has an effect"),
+    "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
     "reproduce": ("dexsim_ppo.reproduce", "replay a faulty training iteration"),
 }

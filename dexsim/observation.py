@@ -93,6 +93,11 @@ def _relative_orientation(f: Features) -> jax.Array:
     return _encode(relative, f.encoding)
 
 
+def _given(reading: jax.Array | None) -> jax.Array:
+    assert reading is not None, "`Readings` without this reading"
+    return reading
+
+
 def _per_joint(hand: Hand, encoding: str) -> int:
     return hand.num_joints
 
@@ -129,10 +134,10 @@ FIELDS: dict[str, ObservationField] = {
             "past_actions",
             lambda hand, encoding: 2 * hand.num_joints,
             "policy",
-            lambda f: jnp.ravel(f.readings.past_actions),
+            lambda f: _given(f.readings.past_actions).ravel(),
             scale=1.0,
         ),
-        ObservationField("palm_gravity", _fixed(3), "imu", lambda f: f.readings.palm_gravity, scale=1.0),
+        ObservationField("palm_gravity", _fixed(3), "imu", lambda f: _given(f.readings.palm_gravity), scale=1.0),
         ObservationField("relative_orientation", _angles, "imu", _relative_orientation),
         ObservationField("object_orientation", _angles, "imu", lambda f: _encode(f.readings.object_quat, f.encoding)),
         ObservationField("fingertip_velocity", _per_finger(6), "simulator", lambda f: f.twist().ravel()),

@@ -34,7 +34,7 @@ COMMANDS = {
     "dexsim_real.twin": ("dexsim_real.twin.options:TwinArguments", []),
     "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
     "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
-    "dexsim.randomization_check": ("dexsim.randomization_check:CheckArguments", []),
+    "dexsim.randomization_check": ("dexsim.randomization_check.__main__:CheckArguments", []),
 }
 CASES = [(command, "") for command in COMMANDS if command != "dexsim_ppo.train"]
 CASES += [("dexsim_ppo.train", task) for task in ("grasp", "rotate")]

@@ -44,7 +44,7 @@ COMMANDS = {
     "dexsim_real.replay": "dexsim_real.replay.__main__:ReplayArguments",
     "dexsim.check_hand": "dexsim.check_hand:CheckHandArguments",
     "dexsim.view": "dexsim.view.__main__:ViewArguments",
-    "dexsim.randomization_check": "dexsim.randomization_check:CheckArguments",
+    "dexsim.randomization_check": "dexsim.randomization_check.__main__:CheckArguments",
 }
 """The commands whose options are one dataclass; those of `dexsim_ppo.train` depend on the task."""
 

@@ -102,9 +102,8 @@ class SensorSuite:
         return readings, memory
 
     def _past_actions(self, last_action: jax.Array, last: State | None) -> jax.Array:
-        if last is None:
+        if last is None or last.readings.past_actions is None:
             return jnp.stack([last_action, last_action])
-        assert last.readings.past_actions is not None
         return jnp.stack([last.readings.last_action, last.readings.past_actions[0]])
 
     def _palm_gravity(self, episode: Episode) -> jax.Array:

@@ -95,7 +95,7 @@ class Controller:
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
         self.correction = np.zeros((), np.float32)  # of the command, by the force loop
-        self.past_actions = np.tile(self._recall(self.last_action, self.target), (2, 1))  # as observations show them
+        self.actions = np.tile(self._recall(self.last_action, self.target), (3, 1))  # as observations show them
         self.carry = self.policy.initial_carry()
 
     def resume(self, position: np.ndarray) -> None:
@@ -116,9 +116,8 @@ class Controller:
           goal_quat: [4] goal orientation of the object.
           command: grip command in [0, 1].
         """
-        last_action = np.asarray(self._recall(self.last_action, self.target))
-        readings = make_readings(measured, estimate, goal_quat, command, last_action, self.past_actions)
-        self.past_actions = np.stack([last_action, self.past_actions[0]])
+        self.actions = np.stack([self._recall(self.last_action, self.target), *self.actions[:2]])
+        readings = make_readings(measured, estimate, goal_quat, command, self.actions)
         if self.spec.force_loop:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)

@@ -11,7 +11,6 @@ import math
 import struct
 import threading
 import time
-from typing import Any
 
 import numpy as np
 
@@ -168,7 +167,14 @@ class Imu(ImuReader):
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
         super().__init__(mount, port)
         self._stop = threading.Event()
-        self._serial = _open(port)
+        try:
+            import serial
+        except ImportError:
+            raise HandError(f"pyserial is missing: {install_line('real')}") from None
+        try:
+            self._serial = serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
+        except PORT_ERRORS as error:
+            raise HandError(explain(port, error)) from None
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
 
@@ -198,14 +204,3 @@ class Imu(ImuReader):
             except OSError:
                 return  # `Safety` reacts to the age of the last sample.
             self.receive(time.monotonic(), data)
-
-
-def _open(port: str) -> Any:
-    try:
-        import serial
-    except ImportError:
-        raise HandError(f"pyserial is missing: {install_line('real')}") from None
-    try:
-        return serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
-    except PORT_ERRORS as error:
-        raise HandError(explain(port, error)) from None

@@ -40,14 +40,11 @@ class ObjectSensors:
 
     def read(self, now: float) -> tuple[ObjectEstimate, float]:
         """The estimate, and the time in s of the newest orientation."""
-        position, velocity, quat, when = self._reference, np.zeros(3), IDENTITY, now
-        gravity = np.zeros(3)
-        if self._camera:
-            _, position, velocity = self._camera.read()
-        if self._imu:
-            when, quat = self._imu.read()
-            gravity = self._imu.palm_gravity
-        return ObjectEstimate(position, velocity, quat, gravity), when
+        position, velocity = self._camera.read()[1:] if self._camera else (self._reference, np.zeros(3))
+        if not self._imu:
+            return ObjectEstimate(position, velocity, IDENTITY), now
+        when, quat = self._imu.read()
+        return ObjectEstimate(position, velocity, quat, self._imu.palm_gravity), when
 
     def lost(self, now: float, limit: float) -> str:
         """Why a measurement is older than `limit` s, with the sensor; empty if none is."""

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -21,8 +20,7 @@ class ObjectEstimate:
     position: np.ndarray  # [3] m
     velocity: np.ndarray  # [3] m/s
     quat: np.ndarray  # [4] (w, x, y, z)
-    palm_gravity: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
-    """[3] unit vector, by the IMU's alignment; zeros without an IMU."""
+    palm_gravity: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # [3]; zeros without an IMU
 
 
 def sources_of(names: Sequence[str]) -> set[str]:
@@ -40,24 +38,16 @@ def sources_of(names: Sequence[str]) -> set[str]:
 
 
 def make_readings(
-    measured: HandMeasurement,
-    estimate: ObjectEstimate,
-    goal_quat: np.ndarray,
-    command: float,
-    last_action: np.ndarray,
-    past_actions: np.ndarray,
+    measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float, actions: np.ndarray
 ) -> Readings:
     """The `Readings` of one tick, float32 as in simulation.
 
     Args:
-      measured: of the hand.
-      estimate: of the object.
       goal_quat: [4] goal orientation of the object.
       command: grip command in [0, 1].
-      last_action: [J] the action that led to these measurements.
-      past_actions: [2, J] the two before it, newest first.
+      actions: [3, J] the action that led to these measurements and the two before it, newest first.
     """
-    known = {
+    values = {
         "joint_position": measured.joint_position,
         "joint_torque": measured.joint_torque,
         "taxel_force": measured.taxel_force,
@@ -66,9 +56,8 @@ def make_readings(
         "object_quat": estimate.quat,
         "goal_quat": goal_quat,
         "command": command,
-        "last_action": last_action,
-        "past_actions": past_actions,
+        "last_action": actions[0],
+        "past_actions": actions[1:],
         "palm_gravity": estimate.palm_gravity,
     }
-    arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in known.items()}
-    return Readings(**arrays)
+    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})

@@ -12,7 +12,8 @@ from episodes import with_episode
 import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.randomization import Randomization, sample_hand
-from dexsim.randomization_check import check, conclude
+from dexsim.randomization_check.__main__ import conclude
+from dexsim.randomization_check.effects import check
 from dexsim.tasks.rotate.config import RotateConfig
 
 TIMES = dict(timestep=0.005, control_period=0.03)

@@ -13,7 +13,7 @@ from dexsim.core.compilation import jit
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.randomization import Randomization
-from dexsim.randomization_check import check
+from dexsim.randomization_check.effects import check
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor

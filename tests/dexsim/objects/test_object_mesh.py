@@ -19,7 +19,7 @@ from dexsim.objects.boxes import fit_boxes
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
 from dexsim.objects.params import sample_object, toward_nominal, unit_inertia
-from dexsim.randomization_check import check
+from dexsim.randomization_check.effects import check
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 

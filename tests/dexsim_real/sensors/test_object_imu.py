@@ -92,15 +92,6 @@ def test_one_known_pose_aligns_all_three_angles(world, first, later):
     assert apart(imu.multiply(found, wxyz(world.inv() * later)), wxyz(later)) < 2e-3
 
 
-@given(turns)
-def test_alignment_gives_gravity_in_the_palm_frame(palm):
-    """`palm` turns the palm frame into the IMU's world, whose z is up."""
-    reader = imu.ImuReader()
-    reader._newest = 0.0, imu.multiply(np.roll(palm.as_quat(), 1), reader._mount)
-    reader.calibrate(IDENTITY)
-    np.testing.assert_allclose(reader.palm_gravity, palm.inv().apply([0.0, 0.0, -1.0]), atol=1e-6)
-
-
 def test_a_mount_without_a_length_is_refused():
     with pytest.raises(HandError, match=r"^--imu-mount 0 0 0 0: is no orientation \(w, x, y, z\)$"):
         RunArguments(policy="rotate", port="", uncalibrated=True, imu_mount=(0.0, 0.0, 0.0, 0.0))

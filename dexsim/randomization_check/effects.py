@@ -1,25 +1,17 @@
-"""Self-test of the randomisation: does drawing a range change the model, and then motion or readings?
+"""What drawing a range changes: in the episode's draw or the compiled model, and then in motion and readings.
 
-    python -m dexsim.randomization_check --task grasp
-
-Every range is drawn by itself, all others at their nominal values. The same starts and actions are run with and
-without it. A range that changes nothing is an error (exit code 2): somewhere between the configuration and the physics
-it was lost.
+Every range is drawn by itself, all others at their nominal values, and the same starts and actions are run with and
+without it.
 """
 
 import dataclasses
-import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core import cli
-from dexsim.core.compilation import jit
-from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import align
 from dexsim.env.env import Env
 from dexsim.env.episode import EpisodeSampler
@@ -27,7 +19,6 @@ from dexsim.env.senses import SensorSuite
 from dexsim.env.state import Episode, State
 from dexsim.objects.config import SHAPES, nominal
 from dexsim.randomization import NOMINAL
-from dexsim.registry import find_task, make
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat", "palm_gravity")
 _DEVIATIONS = ("encoder_bias", "gravity_tilt", "com_offset", "bias", "drift")  # where they are one number
@@ -99,6 +90,14 @@ def check(
     def run(episode: Episode) -> dict[str, np.ndarray]:
         return _run(env, step, dataclasses.replace(states, episode=episode), actions)
 
+    def draw(path: str, config: Any) -> Episode:
+        sampler = EpisodeSampler(config, env.hand, env.task, SensorSuite(config, env.hand, env.task))
+        keys, objects = jax.random.split(key, (4, len(states.tick))), states.episode.object
+        if path in env.task.object_ranges:  # of a shape that has this range
+            shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(path.split(".")[-1].split("_")[0], "box")))
+            objects = jax.vmap(lambda one: env.task.sample_object(one, config, shape))(keys[3])
+        return jax.vmap(sampler.sample)(keys[0], keys[1], keys[2], objects)
+
     def effect(path: str) -> Effect:
         span = _at(env.config, path)
         if (span[1] - span[0] if isinstance(span, tuple) else span) == 0:
@@ -106,8 +105,7 @@ def check(
         config = perfect
         for aid, value in _AIDS.get(path, {}).items():
             config = _with(config, aid, value)
-        shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(path.split(".")[-1].split("_")[0], "box")))
-        before, after = (_draw(env, c, key, len(states.tick), shape) for c in (config, _with(config, path, span)))
+        before, after = draw(path, config), draw(path, _with(config, path, span))
         base = run(before)
         size = {name: float(np.sqrt(np.mean(base[name] ** 2))) or 1.0 for name in READINGS}
         moved = {name: float(np.max(values)) for name, values in _distance(run(after), base).items()}
@@ -120,17 +118,6 @@ def check(
         return Effect(path, changed, moved["joint"], moved["object"], moved[which] / size[which], which)
 
     return [effect(path) for path in names or paths]
-
-
-def _draw(env: Env, config: Any, key: jax.Array, count: int, shape: jax.Array) -> Episode:
-    """Episodes [count] as this configuration draws them."""
-    sampler = EpisodeSampler(config, env.hand, env.task, SensorSuite(config, env.hand, env.task))
-
-    def draw(key: jax.Array) -> Episode:
-        keys = jax.random.split(key, 4)
-        return sampler.sample(*keys[:3], env.task.sample_object(keys[3], config, shape))
-
-    return jax.vmap(draw)(jax.random.split(key, count))
 
 
 def _run(env: Env, step: Callable, states: State, actions: jax.Array) -> dict[str, np.ndarray]:
@@ -160,7 +147,7 @@ def changes(before: Any, after: Any) -> tuple[str, ...]:
 
 
 def _is_range(name: str, value: Any) -> bool:
-    pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, float) for v in value)
+    pair = isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, int | float) for v in value)
     return pair or name in _DEVIATIONS and isinstance(value, float)
 
 
@@ -188,58 +175,3 @@ def _with(config: Any, path: str, value: Any) -> Any:
     """`config` with a value at a dotted path."""
     head, _, rest = path.partition(".")
     return dataclasses.replace(config, **{head: _with(getattr(config, head), rest, value) if rest else value})
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CheckArguments(Config):
-    """Show that every range of the randomisation has an effect."""
-
-    task: str = "grasp"
-    """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
-    backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
-    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
-    num_envs: int = setting(16, unit="1", low=2, high=65536)
-    """Hands sampled for each range."""
-    ticks: int = setting(12, unit="1", low=1, high=1000)
-    """Control ticks to compare."""
-    seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
-    """Seed of starts, samples and actions."""
-
-
-def conclude(effects: Sequence[Effect]) -> int:
-    """Print the table; the exit code."""
-    print(f"{'range':34}{'joints':>13}{'object':>12}{'reading':>9}  what changed")
-    for effect in effects:
-        verdict = "off: no width" if effect.off else ", ".join(effect.changed) or "nothing"
-        verdict = verdict if effect.works else f"NO EFFECT ({verdict})"
-        motion = f"{1e3 * effect.joint:8.3f} mrad{1e3 * effect.object:9.3f} mm{effect.reading:9.4f}"
-        print(f"{effect.name:34}{motion}  {verdict}")
-    lost = [effect.name for effect in effects if not effect.works]
-    if lost:
-        print(f"error: no effect on model or motion: {', '.join(lost)}", file=sys.stderr)
-    return 2 if lost else 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code: 0, or 2 where a range has no effect."""
-    arguments = cli.parse(
-        CheckArguments,
-        sys.argv[1:] if argv is None else argv,
-        prog="python -m dexsim.randomization_check",
-        description="Show that every range of the randomisation has an effect.",
-    )
-    entry = find_task(arguments.task)
-    if entry.environment:
-        raise ConfigError(f"--task {arguments.task}: is no task on a hand: it has no randomisation to check")
-    config = dataclasses.replace(entry.config(), pool_size=80)
-    env = make(arguments.task, config, backend=arguments.backend)
-    keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
-    states = jit(jax.vmap(env.reset), once=True)(keys)
-    step = jit(jax.vmap(env.step), backend=env.backend)
-    effects = check(env, step, states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks)
-    print(f"{arguments.task} on {env.backend}, {arguments.num_envs} hands, {arguments.ticks} ticks")
-    return conclude(effects)
-
-
-if __name__ == "__main__":
-    cli.run(main)
