@@ -30,7 +30,6 @@ from dexsim.core.config import override, setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
-from dexsim.registry import find_task
 from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.types import Environment
@@ -272,9 +271,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
-    entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
-    with cli.naming_options(entry.config_class, entry.config()):
-        env = policy.make_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+    hand = policy.find_hand(arguments.hand)
+    env = policy.make_env(backend=arguments.backend, num_envs=chunk, hand=hand)
     if video and isinstance(env, Adapted):
         raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from c_scene import skin_law
 from episodes import with_episode
+from palm_touch import feel
 
 import dexsim
 from dexsim import observation
@@ -28,7 +29,6 @@ from dexsim.sensing.config import Sensing
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import COMMANDS
-from dexsim.touch.feel import feel
 from dexsim.touch.reduce import reduce_touch
 
 WORLDS = 8
