@@ -229,6 +229,8 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
                 raise ValueError(f"the first line must read {','.join(COLUMNS)}")
             for entry in reader:
                 line = reader.line_num
+                if entry["finger"] not in fingers:
+                    raise ValueError(f"no finger {entry['finger']!r:.60}; the hand has {', '.join(fingers)}")
                 place = fingers.index(entry["finger"]), int(entry["column"]), int(entry["row"])
                 values = np.array([float(entry[name]) for name in COLUMNS[3:]])
                 if not 0 <= place[1] < columns or not 0 <= place[2] < rows:

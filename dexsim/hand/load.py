@@ -160,8 +160,9 @@ def _read_table(path: Path) -> HandFile:
         raise AssetError(f"{path}: {error}") from None
     if (table.taxel_pitch is None) != bool(table.taxels):
         raise AssetError(f"{path}: give either taxels (a file) or taxel_pitch (a lattice on each finger's pad)")
-    if not table.fingers:
-        raise AssetError(f"{path}: no [[fingers]]")
+    names = [finger.name for finger in table.fingers]
+    if not names or len(set(names)) < len(names):
+        raise AssetError(f"{path}: [[fingers]] are named {names}: expected one or more, each with a name of its own")
     return table
 
 
@@ -229,12 +230,14 @@ def _hinges_of_bodies(model_path: Path, model: Any, palm: int, row: dict[int, in
 
 def _find_tips(path: Path, model_path: Path, model: Any, table: HandFile, row: dict[int, int]) -> list[int]:
     """Each finger's tip site; its root joint must be one of the TOML's, and move it."""
-    tips = []
+    tips: list[int] = []
     for finger in table.fingers:
         tip = _find(path, model_path, model, "site", finger.tip)
         body = int(model.site_bodyid[tip])
         if body not in row:
             raise AssetError(f"{path}: tip {finger.tip!r} is on no body of {table.palm!r}")
+        if body in model.site_bodyid[tips]:  # the physics gives the force on a link, not where on it
+            raise AssetError(f"{path}: tip {finger.tip!r} is on {model.body(body).name!r}, as another finger's tip")
         if finger.root_joint not in table.joints:
             raise AssetError(f"{path}: root_joint {finger.root_joint!r} is not among joints")
         root = _find(path, model_path, model, "joint", finger.root_joint)
