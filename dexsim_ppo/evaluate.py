@@ -29,7 +29,6 @@ from dexsim.core.config import Config, override, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
-from dexsim.registry import find_task
 from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
@@ -271,9 +270,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
-    entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
-    with cli.naming_options(entry.config_class, entry.config()):
-        env = policy.make_env(backend=arguments.backend, hand=hand)
+    env = policy.make_env(backend=arguments.backend, hand=policy.find_hand(arguments.hand))
     report, snapshots = _measure(policy, env, arguments, label=arguments.policy)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"hand": arguments.hand or None} | cli.environment_report()

@@ -131,12 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     with processes.exit_on_error():
         arguments, source = parse_arguments(argv)
-        with cli.naming_options(TrainArguments, arguments):
-            if arguments.seeds > 1:
-                run, stopped = train_seeds(arguments, source, started, command)
-            else:
-                run = make_run(arguments, source, started, command)
-                stopped = train_run(run, source, command)
+        if arguments.seeds > 1:
+            run, stopped = train_seeds(arguments, source, started, command)
+        else:
+            run = make_run(arguments, source, started, command)
+            stopped = train_run(run, source, command)
     if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
@@ -320,8 +319,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
     arguments = dataclasses.replace(arguments, task=default.task)
     if isinstance(source, checkpoint.Checkpoint):
-        with cli.naming_options(options, default):
-            check_resumed(arguments, default)
+        check_resumed(arguments, default)
     return arguments, source
 
 

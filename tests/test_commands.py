@@ -18,6 +18,7 @@ import pytest
 import tyro
 
 from dexsim.core import cli
+from dexsim.core.errors import ConfigError
 from dexsim.registry import TASKS
 from dexsim_ppo.train import preset_arguments
 
@@ -55,22 +56,16 @@ class Found(typing.NamedTuple):
         return set(leaves(self.hint))
 
     @property
-    def choices(self):
-        """From its metadata, or its Literal type."""
-        literals = [leaf for leaf in leaves(self.hint, literal=True) if isinstance(leaf, str)]
-        return tuple(self.field.metadata.get("choices") or literals)
-
-    @property
     def numeric(self):
         return bool(self.types & {int, float})
 
 
-def leaves(hint, literal=False):
+def leaves(hint):
     if typing.get_origin(hint) is typing.Literal:
-        yield from typing.get_args(hint) if literal else {type(value) for value in typing.get_args(hint)}
+        yield from {type(value) for value in typing.get_args(hint)}
     elif typing.get_args(hint):
         for argument in typing.get_args(hint):
-            yield from leaves(argument, literal)
+            yield from leaves(argument)
     else:
         yield hint
 
@@ -102,32 +97,6 @@ def load(command, task):
 
 def options(command, task):
     return [found for found in load(command, task)[2] if found.hint is not None]
-
-
-def shown(capsys, command, *argv):
-    """What a command prints for its help."""
-    package = command if command.startswith("dexsim_ppo.") else f"{command}.__main__"
-    with pytest.raises(SystemExit) as stop:
-        importlib.import_module(package).main(list(argv))
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 80
-    return text
-
-
-def entries(text):
-    """The options of a help page: by name what stands in brackets, and the help text."""
-    found = {}
-    for block in re.split(r"\n(?= {0,2}\S)", text):
-        match = re.match(r"  ([\w.-]+)(?:,? [^\[*]*)\[([^\[]*)\] ?(.*)", block.replace("\n", " ").replace("      ", ""))
-        if match:
-            found[match[1]] = match[2], match[3].strip()
-    return found
-
-
-def number(value):
-    """A number as help pages print it."""
-    return f"{value:.0f}" if value == int(value) and abs(value) < 1e10 else f"{value:.7g}"
 
 
 @functools.cache
@@ -170,11 +139,9 @@ def test_every_option_says_what_it_is(command, task):
 def test_help_starts_no_device():
     """With a platform that does not exist every start of JAX's devices fails."""
     environment = os.environ | {"JAX_PLATFORMS": "none_such", "COLUMNS": "80"}
-    for command in ("dexsim_ppo.train", "dexsim_ppo.evaluate", "dexsim.randomization_check"):
-        child = subprocess.run(
-            [sys.executable, "-m", command, "--help"], env=environment, capture_output=True, text=True, check=False
-        )
-        assert child.returncode == 0 and child.stdout.startswith("usage: "), child.stderr
+    command = [sys.executable, "-m", "dexsim_ppo.train", "--help"]
+    child = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert child.returncode == 0 and child.stdout.startswith("usage: "), child.stderr
 
 
 # --- errors ---------------------------------------------------------------------------------------------
@@ -183,18 +150,24 @@ def test_help_starts_no_device():
 @pytest.mark.parametrize(
     ("command", "option", "says"),
     [
-        ("dexsim_ppo.train", ["--env.push-probability", "3"], "--env.push-probability 3: must be between 0 and 1"),
-        ("dexsim_ppo.train", ["--ppo.num-envs", "0"], "--ppo.num-envs 0: "),
-        ("dexsim_ppo.train", ["--env.curl", "0.2", "-0.2"], "--env.curl (0.2, -0.2): the first must not exceed"),
-        ("dexsim_ppo.evaluate", ["--chunk", "-1"], "--chunk -1: "),
-        ("dexsim.randomization_check", ["--num-envs", "0"], "--num-envs 0: "),
+        (
+            "dexsim_ppo.train",
+            ["--env.push-probability", "3"],
+            "GraspConfig.push_probability = 3: must be between",
+        ),
+        (
+            "dexsim_ppo.train",
+            ["--env.curl", "0.2", "-0.2"],
+            "GraspConfig.curl = (0.2, -0.2): the first must not",
+        ),
+        ("dexsim_ppo.evaluate", ["--chunk", "-1"], "EvaluateArguments.chunk = -1: "),
     ],
 )
-def test_a_value_out_of_range_is_refused_by_the_options_name(command, option, says):
+def test_a_value_out_of_range_is_refused_by_the_fields_name(command, option, says):
     cls, default, _ = load(command, "grasp" if command == "dexsim_ppo.train" else "")
     if default is not None:
         cls = cls[type(default.env)]
-    with pytest.raises(cli.UsageError) as error:
+    with pytest.raises(ConfigError) as error:
         cli.parse(cls, [*COMMANDS[command][1], *option], prog=command, description="", default=default)
     assert str(error.value).startswith(says) and "\n" not in str(error.value)
 
@@ -212,11 +185,3 @@ def test_the_catalog_lists_what_there_is(capsys):
     assert main([]) == 0
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("rotate_clear", "xhand_right (default)", "leap_like", "grasp"))
-
-
-def test_classes_of_one_command_have_names_of_their_own():
-    """Messages are translated by class name, so that none may stand for two groups."""
-    for command, task in CASES:
-        owners = [(found.name.rpartition(".")[0], found.owner) for found in options(command, task)]
-        names = [owner.__name__ for _, owner in dict.fromkeys(owners)]
-        assert len(names) == len(set(names)), command

@@ -287,12 +287,7 @@ def test_cited_commits_exist():
     "change",
     [
         {"id": "Two words"},
-        {"date": "23 November 2026"},
-        {"commit": "af96a1c with other contacts"},
-        {"seeds": ["one"]},
         {"metrics": {"held_pct": None}},
-        {"metrics": {"held_pct_ci95": [98.9]}},
-        {"verdict": 3},
         {"mood": "good"},
     ],
 )

@@ -44,23 +44,21 @@ def pd_torque(
     return actuator.stiffness * (target - position) + actuator.damping * (target_velocity - velocity)
 
 
-def dead_band(actuator: Actuator, torque: jax.Array, target: jax.Array, position: jax.Array) -> jax.Array:
-    """tau_b = 0 where |q_ref - q| < epsilon, else tau_c."""
-    return jnp.where(jnp.abs(target - position) < actuator.dead_band, 0.0, torque)
-
-
 def torque_limit(actuator: Actuator, velocity: jax.Array) -> jax.Array:
     """tau_sat = tau_0 (1 - |qd| / qd_max), not below zero beyond the no-load speed, Nm."""
     return actuator.stall_torque * jnp.maximum(1.0 - jnp.abs(velocity) / actuator.no_load_speed, 0.0)
 
 
-def wanted_torque(
+def demanded_torque(
     actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
-    """tau_b at the measured angle, position + encoder bias: what the loop asks for, Nm, whatever the limit."""
+    """tau_b at the measured angle, position + encoder bias: what the loop asks for, Nm, whatever the limit.
+
+    tau_b = 0 where |q_ref - q| < epsilon, else tau_c.
+    """
     measured = position if actuator.encoder_bias is None else position + actuator.encoder_bias
     torque = pd_torque(actuator, target, target_velocity, measured, velocity)
-    return dead_band(actuator, torque, target, measured)
+    return jnp.where(jnp.abs(target - measured) < actuator.dead_band, 0.0, torque)
 
 
 def joint_torque(
@@ -72,7 +70,7 @@ def joint_torque(
 
     Args: scalars, or arrays that broadcast; `drive` is this, vmapped over the joints.
     """
-    torque = wanted_torque(actuator, target, target_velocity, position, velocity)
+    torque = demanded_torque(actuator, target, target_velocity, position, velocity)
     limit = torque_limit(actuator, velocity)
     torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
     if actuator.ripple is None:
@@ -91,7 +89,7 @@ def at_limit(
     actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
     """Whether joints [J] bool are at their torque limit: |tau_b| >= tau_sat. The arguments are those of `drive`."""
-    torque = wanted_torque(actuator, target, target_velocity, position, velocity)
+    torque = demanded_torque(actuator, target, target_velocity, position, velocity)
     return jnp.abs(torque) >= torque_limit(actuator, velocity)
 
 

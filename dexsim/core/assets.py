@@ -1,40 +1,36 @@
 """Paths: the files of `assets/` (beside the packages in a checkout, inside `dexsim` when installed), and the cache."""
 
+import contextlib
+import hashlib
+import io
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from dexsim.core.errors import AssetError
+from dexsim.core.files import write_whole
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def assets_root() -> Path:
-    """The folder that holds `hand/`, `policies/` and the other assets.
-
-    Raises:
-      AssetError: neither a checkout nor an installed copy with assets.
-    """
-    for root in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
-        if root.is_dir():
-            return root.resolve()
-    raise AssetError(f"no assets found in {_PACKAGE / '_assets'} or {_PACKAGE.parent / 'assets'}: install dexsim again")
+    """The folder that holds `hand/`, `policies/` and the other assets."""
+    installed = _PACKAGE / "_assets"
+    return installed if installed.is_dir() else _PACKAGE.parent / "assets"
 
 
 def asset_path(name: str) -> Path:
-    """Absolute path of an asset, from its name relative to `assets/`.
-
-    Args:
-      name: such as `"hand/xhand_right.xml"`; folders are allowed.
+    """Absolute path of an asset, from its name relative to `assets/`, such as `"hand/xhand_right.xml"`.
 
     Raises:
-      AssetError: the name leads outside of `assets/`, or there is no such file.
+      AssetError: there is no such file or folder.
     """
-    root = assets_root()
-    path = (root / name).resolve()
-    if not path.is_relative_to(root):
-        raise AssetError(f"asset {name!r} lies outside of {root}")
+    path = assets_root() / name
     if not path.exists():
-        raise AssetError(f"no asset {name!r} in {root}")
+        raise AssetError(f"no asset {name!r} in {assets_root()}")
     return path
 
 
@@ -45,3 +41,24 @@ def cache_path(name: str) -> Path:
     """
     root = os.environ.get("DEXSIM_CACHE")
     return (Path(root) if root else Path.home() / ".cache" / "dexsim") / name
+
+
+def cached_arrays(folder: str, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Arrays that `make` computes the first time, and a file of the cache has afterwards.
+
+    Args:
+      folder: of the cache.
+      key: says all that the arrays depend on.
+      make: names and arrays.
+    """
+    path = cache_path(folder) / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npz"
+    try:
+        with np.load(path) as file:
+            return dict(file)
+    except Exception:  # missing, damaged, or of an older program: make it anew
+        arrays = make()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    with contextlib.suppress(OSError):  # a cache that cannot be written is no error
+        write_whole(path, [buffer.getbuffer()])
+    return arrays

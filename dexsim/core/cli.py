@@ -1,23 +1,20 @@
 """What the commands share: options from dataclasses, one-line errors, compilation caches."""
 
 import contextlib
-import dataclasses
 import errno
 import importlib.metadata
 import json
 import math
 import os
 import platform
-import re
 import sys
-import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import AssetError, ConfigError, DexsimError, DexsimWarning
+from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import is_device, make_private, write_whole
 from dexsim.core.install import DISTRIBUTION
 
@@ -25,10 +22,6 @@ T = TypeVar("T")
 
 LOADING = "loading JAX and MuJoCo"
 """What `announce` says before the imports of a command that takes seconds over them."""
-
-
-class UsageError(ConfigError):
-    """An option is unknown, or its value is of the wrong type or out of range."""
 
 
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
@@ -65,40 +58,12 @@ def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, def
     """Options of a dataclass, through tyro, which answers `--help` and refuses what does not parse.
 
     Raises:
-      UsageError: a value is out of range; names the option.
+      ConfigError: a value is out of range; names the option's class and field.
     """
     import tyro
 
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
-    with naming_options(cls, default):
-        return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
-
-
-@contextlib.contextmanager
-def naming_options(cls: type, default: Any = None) -> Iterator[None]:
-    """Errors from within that name a field of these options, such as `GraspConfig.push_speed = 9`, name the option as
-    it is typed, `--env.push-speed 9`."""
-    try:
-        yield
-    except (ConfigError, AssetError) as error:
-        names = _option_names(cls, default)
-        text = re.sub(r"\b(\w+\.\w+)( =)?", lambda match: names.get(match[1], match[0]), str(error))
-        raise (UsageError if isinstance(error, ConfigError) else AssetError)(text) from None
-
-
-def _option_names(cls: type, default: Any = None, path: str = "--") -> dict[str, str]:
-    """The option of every field of a dataclass and of those nested in it, by class and field."""
-    cls, names = typing.get_origin(cls) or cls, dict[str, str]()
-    for field in dataclasses.fields(cls):
-        value = getattr(default, field.name, field.default)
-        if value is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
-            value = field.default_factory()
-        option = path + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(value):
-            names |= _option_names(type(value), value, f"{option}.")
-        else:
-            names[f"{cls.__name__}.{field.name}"] = option
-    return names
+    return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
 
 
 def announce(text: str) -> None:
@@ -127,11 +92,9 @@ def _cache(name: str) -> str | None:
     path = cache_path(name)
     try:
         make_private(path)
-    except PermissionError as error:
+    except OSError as error:
         warnings.warn(f"no cache of compiled code: {error}", DexsimWarning, stacklevel=3)
         return None
-    except OSError:  # Nothing can be written: the library that owns the cache says so, or goes without.
-        pass
     return str(path)
 
 
@@ -165,7 +128,7 @@ def check_writable(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    place = path if is_device(path) else Path(os.path.realpath(path)).parent
+    place = path if is_device(path) else path.resolve().parent
     if not os.access(place, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
 

@@ -25,10 +25,9 @@ def available_cores() -> int:
 def jit(function: Callable, *, backend: str = "mjx", once: bool = False, **options: Any) -> Any:
     """`jax.jit` with less optimisation on a CPU, where that pays off.
 
-    A physics step in JAX is one very large program. On two cores this halves its compilation time for a few
-    per cent of speed; otherwise a short training run would be mostly compilation. Programs that leave the physics to
-    the host are smaller, take as long to compile either way, and run a quarter faster when fully optimised. With an
-    environment from elsewhere the learner may be most of it, so only LLVM optimises less there.
+    A physics step in JAX is one very large program: on two cores this halves its compilation time for a few per cent
+    of speed. Programs that leave the physics to the host run a quarter faster when fully optimised. With an environment
+    from elsewhere the learner may be most of the program, so only LLVM optimises less there.
 
     Args:
       backend: of the physics in it; "own" for an environment from elsewhere.
@@ -65,11 +64,11 @@ def make_deterministic() -> bool:
 @functools.cache
 def _light() -> dict[str, Any]:
     """The options that this version of XLA knows."""
-    known = {}
+    accepted = {}
     for name, value in LIGHT:
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # XLA's own error types differ by version
             continue
-        known[name] = value
-    return known
+        accepted[name] = value
+    return accepted

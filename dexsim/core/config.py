@@ -23,7 +23,7 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 def setting(
-    default: Any,
+    default: Any = dataclasses.MISSING,
     *,
     unit: str = "",
     low: float | None = None,
@@ -51,23 +51,9 @@ def validate(config: Any) -> None:
     cls: type = type(config)
     for field in dataclasses.fields(cls):
         where = f"{cls.__name__}.{field.name}"
-        value = _checked(_hints(cls).get(field.name), getattr(config, field.name), where)
-        if value is not getattr(config, field.name):
-            object.__setattr__(config, field.name, value)
-        choices = choices_of(cls).get(field.name)
-        if choices is not None and value is not None:
-            for item in value if isinstance(value, tuple) else (value,):
-                if item not in choices:
-                    raise ConfigError(f"{where} = {item!r:.80}: choose from {', '.join(map(str, choices))}")
-        low, high = field.metadata.get("low"), field.metadata.get("high")
-        for number in _numbers(value):
-            if not math.isfinite(number):
-                raise ConfigError(f"{where} = {number}: must be a finite number")
-            if (low is not None and number < low) or (high is not None and number > high):
-                unit = field.metadata.get("unit")
-                unit = f" {unit}" if unit and unit != "1" else ""
-                span = range_text(low, high, "between {} and {}")
-                raise ConfigError(f"{where} = {number_text(number)}{unit}: must be {span}{unit}")
+        value = _convert(_hints(cls).get(field.name), getattr(config, field.name), where)
+        object.__setattr__(config, field.name, value)
+        _check_values(field.metadata, value, where)
 
 
 class Config:
@@ -81,14 +67,6 @@ class Config:
 
 
 @functools.cache
-def choices_of(cls: type) -> dict[str, tuple[Any, ...]]:
-    """What each field may be, where only some values may: by its `setting` or its `Literal` type."""
-    fields, hints = dataclasses.fields(cls), _hints(cls)
-    choices = {field.name: field.metadata.get("choices") or _literals(hints.get(field.name)) for field in fields}
-    return {name: values for name, values in choices.items() if values}
-
-
-@functools.cache
 def _hints(cls: type) -> dict[str, Any]:
     """The types of a class's fields; none if one of them is only imported by type checkers."""
     try:
@@ -97,44 +75,28 @@ def _hints(cls: type) -> dict[str, Any]:
         return {}
 
 
-def _checked(hint: Any, value: Any, where: str) -> Any:
-    """A field's value as `_rebuild` has it. A configuration in a field is one already, and integers are numbers too."""
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        if not isinstance(value, hint):
-            raise ConfigError(f"{where} = {value!r:.80}: expected a {hint.__name__}")
-        return value
-    if hint not in (bool, int, float, str) and typing.get_origin(hint) is not tuple:
-        return value
-    value = _plain(value)
-    rebuilt = _rebuild(hint, value, where)
-    return value if value == rebuilt else rebuilt
+def _check_values(metadata: Any, value: Any, where: str) -> None:
+    """Hold a field's value, or each item of a tuple, to the choices and the range of its `setting`."""
+    choices, low, high, unit = (metadata.get(name) for name in ("choices", "low", "high", "unit"))
+    unit = f" {unit}" if unit and unit != "1" else ""
+    for item in value if isinstance(value, tuple) else (value,):
+        if isinstance(item, tuple):
+            _check_values(metadata, item, where)
+            continue
+        if choices is not None and item is not None and item not in choices:
+            raise ConfigError(f"{where} = {item!r:.80}: choose from {', '.join(map(str, choices))}")
+        if isinstance(item, bool) or not isinstance(item, (int, float)):
+            continue
+        if not math.isfinite(item):
+            raise ConfigError(f"{where} = {item}: must be a finite number")
+        if (low is not None and item < low) or (high is not None and item > high):
+            raise ConfigError(f"{where} = {item:.10g}{unit}: must be {_range_text(low, high)}{unit}")
 
 
-def _plain(value: Any) -> Any:
-    """Python's numbers and lists for NumPy's, in a tuple too."""
-    if isinstance(value, (tuple, list)):
-        return type(value)(map(_plain, value))
-    return value.tolist() if hasattr(value, "tolist") else value
-
-
-def range_text(low: float | None, high: float | None, both: str) -> str:
-    """A range in words; `both` is the pattern where it has two ends. Empty without a limit."""
+def _range_text(low: float | None, high: float | None) -> str:
     if low is not None and high is not None:
-        return both.format(number_text(low), number_text(high))
-    if low is not None:
-        return f"at least {number_text(low)}"
-    return f"at most {number_text(high)}" if high is not None else ""
-
-
-def number_text(number: float) -> str:
-    """A number as a person writes it: 100000 rather than 1e+05."""
-    return f"{number:.0f}" if abs(number) < 1e10 and number == int(number) else f"{number:.7g}"
-
-
-def _literals(hint: Any) -> tuple[Any, ...]:
-    if typing.get_origin(hint) is typing.Literal:
-        return typing.get_args(hint)
-    return tuple(value for argument in typing.get_args(hint) for value in _literals(argument))
+        return f"between {low:.10g} and {high:.10g}"
+    return f"at least {low:.10g}" if low is not None else f"at most {high:.10g}"
 
 
 def check_ranges(config: Any, *names: str) -> None:
@@ -143,22 +105,8 @@ def check_ranges(config: Any, *names: str) -> None:
         low, high = getattr(config, name)
         if low > high:
             raise ConfigError(
-                f"{type(config).__name__}.{name} = ({number_text(low)}, {number_text(high)}): "
-                "the first must not exceed the second"
+                f"{type(config).__name__}.{name} = ({low:.10g}, {high:.10g}): the first must not exceed the second"
             )
-
-
-def _numbers(value: Any) -> list[float]:
-    if isinstance(value, bool) or value is None or isinstance(value, str):
-        return []
-    if isinstance(value, (int, float)):
-        try:
-            return [float(value)]
-        except OverflowError:  # A whole number of hundreds of digits.
-            return [math.inf]
-    if isinstance(value, tuple):
-        return [number for item in value for number in _numbers(item)]
-    return []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,15 +114,11 @@ class NoSettings:
     """The configuration of an environment that has none."""
 
 
-def to_dict(config: Any) -> dict[str, Any]:
+def to_dict(config: Any) -> Any:
     """A config dataclass as nested plain dicts and lists (JSON and msgpack friendly)."""
-
-    def plain(value: Any) -> Any:
-        if dataclasses.is_dataclass(value):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
-
-    return plain(config)
+    if dataclasses.is_dataclass(config):
+        return {field.name: to_dict(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    return [to_dict(item) for item in config] if isinstance(config, (tuple, list)) else config
 
 
 def from_dict(cls: type[T], data: dict[str, Any]) -> T:
@@ -185,12 +129,15 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     """
     if not isinstance(data, dict):
         raise ConfigError(f"{cls.__name__}: expected a table of fields, got {type(data).__name__}")
-    hints = typing.get_type_hints(cls)
-    known = {field.name for field in dataclasses.fields(cls)}
+    fields = {field.name: field for field in dataclasses.fields(cls)}
     for name in data:
-        if name not in known:
+        if name not in fields:
             raise ConfigError(f"{cls.__name__} has no field {name!r:.80}")
-    return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
+    for name, field in fields.items():
+        if name not in data and field.default is field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{cls.__name__}.{name} is missing")
+    hints = _hints(cls)
+    return cls(**{name: _convert(hints.get(name), value, f"{cls.__name__}.{name}") for name, value in data.items()})
 
 
 @contextlib.contextmanager
@@ -243,24 +190,30 @@ def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _rebuild(hint: Any, value: Any, where: str) -> Any:
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """A value as its type has it: tuples for lists, Python's numbers for NumPy's, configurations for tables."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        return from_dict(hint, value)
+        return value if isinstance(value, hint) else from_dict(hint, value)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        return _rebuild(next(a for a in arguments if a is not type(None)), value, where)
+        options = [argument for argument in arguments if argument is not type(None)]
+        if (value is None and len(options) < len(arguments)) or len(options) != 1:
+            return value
+        return _convert(options[0], value, where)
+    if origin is typing.Literal and value not in arguments:
+        raise ConfigError(f"{where} = {value!r:.80}: choose from {', '.join(map(str, arguments))}")
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise ConfigError(f"{where} = {value!r:.80}: expected a list")
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_rebuild(arguments[0], item, where) for item in value)
+        if arguments[1:] == (Ellipsis,):
+            arguments = arguments[:1] * len(value)
         if len(value) != len(arguments):
             raise ConfigError(f"{where}: expected {len(arguments)} values, got {len(value)}")
-        return tuple(_rebuild(a, item, where) for a, item in zip(arguments, value, strict=True))
+        return tuple(_convert(a, item, where) for a, item in zip(arguments, value, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return _numbers(value)[0]
-    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
+        return float(value)
+    if hint in (bool, int, float, str) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
         raise ConfigError(f"{where} = {value!r:.80}: expected {hint.__name__}")
     return value

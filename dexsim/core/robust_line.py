@@ -73,9 +73,9 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, s
     fit = regress(design, y, start, order=x, group=group)
     weight, residual = fit.weight, y - design @ fit.value
     (offset, gain), half = fit.value / [1.0, reach], fit.half / [1.0, reach]
-    kept = weight > 0
-    centred = y[kept] - np.average(y[kept], weights=weight[kept])
-    unexplained = np.sum(weight * residual**2) / max(np.sum(weight[kept] * centred**2), 1e-300)
+    inlier = weight > 0
+    centred = y[inlier] - np.average(y[inlier], weights=weight[inlier])
+    unexplained = np.sum(weight * residual**2) / max(np.sum(weight[inlier] * centred**2), 1e-300)
     return Line(
         gain=float(gain),
         offset=float(offset),
@@ -85,7 +85,7 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, s
         r_squared=float(1.0 - unexplained),
         condition=float(np.linalg.cond(design)),
         samples=len(x),
-        outliers=int(np.sum(~kept)),
+        outliers=int(np.sum(~inlier)),
     )
 
 

@@ -9,18 +9,13 @@ Shapes: n nodes along each axis. Units: m.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import hashlib
-import io
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.assets import cache_path
-from dexsim.core.files import write_whole
+from dexsim.core.assets import cached_arrays
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import sdf
@@ -30,7 +25,7 @@ NODES = 64
 PAD = 0.004
 """m, room round the object; must exceed the skin's margin."""
 _VERSION = 1  # of the files in the cache
-_MILLI = 1e-3  # values are kept in mm
+_MILLI = 1e-3  # values are lowered in mm
 _TINY = 1e-20
 
 
@@ -47,13 +42,12 @@ class Grid:
     scale: jax.Array  # [] the object's size relative to the baked one
 
 
-def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES, cache: bool = True) -> Grid:
-    """The grid of an object.
+def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES) -> Grid:
+    """The grid of an object; what was computed from a mesh is lowered in the cache (`sdf`).
 
     Args:
       source: a checked mesh (`mesh.load_mesh`) or a union of primitives with known sizes.
       nodes: along each axis.
-      cache: keep what was computed from a mesh on disk (`cache_folder`) and use it again.
 
     Raises:
       AssetError: the mesh cannot be signed.
@@ -62,12 +56,13 @@ def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES, cache: bool = T
     axes = [np.linspace(a - PAD, b + PAD, nodes) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     if isinstance(source, meshes.Mesh):
-        distance = _measured(source, points, nodes, cache)
+        key = f"{source.fingerprint} {nodes} {PAD!r} {_VERSION}"
+        distance = cached_arrays("sdf", key, lambda: {"distance": _measure(source, points)})["distance"]
     else:
         distance = np.asarray(sdf.signed_distance(jnp.asarray(points, jnp.float32), source))
-    kept = ((distance - _overshoot(distance, axes)) / _MILLI).astype(np.float32)
+    lowered = ((distance - _overshoot(distance, axes)) / _MILLI).astype(np.float32)
     # No cell begins at an axis' last node: what is rolled there is never read.
-    corners = np.stack([np.roll(kept, -((x * nodes + y) * nodes + z)) for x, y, z in np.ndindex(2, 2, 2)], -1)
+    corners = np.stack([np.roll(lowered, -((x * nodes + y) * nodes + z)) for x, y, z in np.ndindex(2, 2, 2)], -1)
     return Grid(
         nodes=nodes,
         values=jnp.asarray(corners.reshape(nodes, nodes * nodes, 8)),
@@ -92,11 +87,6 @@ def distance_and_normal(points: jax.Array, grid: Grid) -> tuple[jax.Array, jax.A
     distance, gradient = _look_up(points, grid)
     length = jnp.sqrt(sum(g * g for g in gradient) + _TINY)
     return distance, jnp.stack([g / length for g in gradient], -1)
-
-
-def cache_folder() -> Path:
-    """Where baked grids are kept: `sdf` in `$DEXSIM_CACHE`, or in `~/.cache/dexsim`."""
-    return cache_path("sdf")
 
 
 def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]:
@@ -158,26 +148,7 @@ def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     return np.where(smooth, total, 0.0).reshape(-1)
 
 
-def _measured(mesh: meshes.Mesh, points: np.ndarray, nodes: int, cache: bool) -> np.ndarray:
-    """Exact distance at the nodes, from the cache if possible."""
-    key = hashlib.sha256(f"{mesh.fingerprint} {nodes} {PAD!r} {_VERSION}".encode()).hexdigest()[:32]
-    path = cache_folder() / f"{key}.npz"
-    if cache and (known := _load(path, len(points))) is not None:
-        return known
+def _measure(mesh: meshes.Mesh, points: np.ndarray) -> np.ndarray:
+    """Exact distance at the nodes, m."""
     meshes.check_sign(mesh)
-    distance = meshes.signed_distance(mesh, points)[0].astype(np.float32)
-    if cache:
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, distance=distance)
-        with contextlib.suppress(OSError):  # a cache that cannot be written is no error
-            write_whole(path, [buffer.getbuffer()])
-    return distance
-
-
-def _load(path: Path, count: int) -> np.ndarray | None:
-    try:
-        with np.load(path) as file:
-            distance = file["distance"]
-    except Exception:  # missing, half written, of an older program: bake again
-        return None
-    return distance if distance.shape == (count,) and np.all(np.isfinite(distance)) else None
+    return meshes.signed_distance(mesh, points)[0].astype(np.float32)

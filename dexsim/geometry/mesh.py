@@ -15,14 +15,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from dexsim.core.errors import AssetError
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
-_BUNCH, _BATCH, _CHUNK = 64, 128, 32  # points in a bunch, bunches and candidate triangles in a compiled call
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
 
 
@@ -59,11 +58,6 @@ class Mesh:
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
 
     @property
-    def volume(self) -> float:
-        """m^3."""
-        return _volume(self.corners)
-
-    @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner [2, 3] m."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
@@ -97,15 +91,10 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Me
     Raises:
       AssetError: not readable, not finite, of no graspable size, open, with inconsistent or inward normals, or flat.
     """
-    vertices, faces, found = _read(source)
-    name = name or found
-    if not len(faces):
-        raise AssetError(f"{name}: no triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise AssetError(f"{name}: a triangle names vertex {faces.max()}, there are {len(vertices)}")
-    bad = np.flatnonzero(~np.all(np.isfinite(vertices), 1))
-    if bad.size:
-        raise AssetError(f"{name}: vertex {bad[0]} is not finite ({bad.size} of {len(vertices)})")
+    vertices, faces, given = _read(source)
+    name = name or given
+    if not np.all(np.isfinite(vertices)):
+        raise AssetError(f"{name}: a vertex is not finite")
     vertices = vertices * scale
     size = float(np.ptp(vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
@@ -183,41 +172,20 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np
 
 
 def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
-    if isinstance(source, Mesh):
-        return source.vertices, source.faces, source.name
-    if isinstance(source, tuple):
-        if len(source) != 2:
-            raise AssetError(f"mesh: a tuple of {len(source)}; give (vertices, faces)")
-        (vertices, faces), name = source, "mesh"
-    else:
-        if isinstance(source, (str, Path)):
-            import trimesh
+    """Vertices [V, 3], faces [T, 3] and the name of what `load_mesh` takes."""
+    name = "mesh"
+    if isinstance(source, (str, Path)):
+        import trimesh
 
-            path = Path(source)
-            if not path.is_file():
-                raise AssetError(f"{path}: no such file")
-            name = str(path)
-            try:
-                source = trimesh.load(path, force="mesh", process=False)
-            except Exception as error:  # each of trimesh's readers raises its own
-                raise AssetError(f"{path}: {' '.join(str(error).split()) or type(error).__name__}") from None
-        else:
-            name = getattr(source, "metadata", {}).get("name", "mesh")
-        if not hasattr(source, "faces") or not hasattr(source, "vertices"):
-            raise AssetError(f"{name}: {type(source).__name__} is no triangle mesh")
-        vertices, faces = source.vertices, source.faces
-    try:
-        vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-        whole = not faces.size or np.array_equal(faces, faces.astype(np.int64))
-    except (TypeError, ValueError) as error:
-        raise AssetError(f"{name}: vertices and triangles must be arrays of numbers ({error})") from None
-    if not whole:
-        raise AssetError(f"{name}: triangles must be whole numbers, the rows of their vertices")
-    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
-        raise AssetError(
-            f"{name}: expected vertices [V, 3] and triangles [T, 3], got {vertices.shape} and {faces.shape}"
-        )
-    return vertices, faces.astype(np.int64), name
+        name = str(source)
+        try:
+            source = trimesh.load(source, force="mesh", process=False)
+        except Exception as error:  # each of trimesh's readers raises its own
+            raise AssetError(f"{name}: {' '.join(str(error).split()) or type(error).__name__}") from None
+    vertices, faces = source if isinstance(source, tuple) else (source.vertices, source.faces)
+    if not len(faces):
+        raise AssetError(f"{name}: no triangles")
+    return np.asarray(vertices, np.float64), np.asarray(faces, np.int64), name
 
 
 def _merge(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -231,22 +199,13 @@ def _merge(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[n
 
 def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: float) -> None:
     """Every edge joins two triangles that run along it in opposite directions, and the volume is positive."""
-    if not len(faces):
-        raise AssetError(f"{name}: encloses no volume (every triangle is a line or a point)")
-    edge = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    low, high = edge.min(1), edge.max(1)
-    _, which, count = np.unique(low * len(vertices) + high, return_inverse=True, return_counts=True)
-    if np.any(count != 2):
-        once, many = int(np.sum(count == 1)), int(np.sum(count > 2))
-        what = f"{once} edges belong to one triangle only" if once else f"{many} edges join more than two triangles"
-        raise AssetError(f"{name}: the surface is open, {what}; close it (trimesh.repair) or use its convex hull")
-    balance = np.zeros(len(count), np.int64)
-    np.add.at(balance, which.reshape(-1), np.where(edge[:, 0] == low, 1, -1))
-    if np.any(balance):
-        raise AssetError(
-            f"{name}: normals point both ways, {np.sum(balance != 0)} edges join triangles of opposite "
-            "winding; trimesh.repair.fix_winding makes them agree"
-        )
+    import trimesh
+
+    surface = trimesh.Trimesh(vertices, faces, process=False)
+    if not surface.is_watertight:
+        raise AssetError(f"{name}: the surface is open; close it (trimesh.repair) or use its convex hull")
+    if not surface.is_winding_consistent:
+        raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
     volume = _volume(vertices[faces])
     if abs(volume) < 1e-6 * size**3:
         raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
@@ -264,109 +223,31 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.where(length > 0, length, 1.0)
 
 
-# --- the nearest point of a mesh to many points; B bunches of points -----------------------------
-
-
 def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest surface point [P, 3] and its pseudo-normal [P, 3].
 
-    Points are handled in bunches of neighbours. A triangle can only be nearest to one of a bunch if it is hardly
-    farther from the bunch's middle than the nearest one is. The search is in single precision; what it found is
-    measured again in double.
+    No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
+    measure for each point.
     """
-    corners = mesh.corners.astype(np.float32)
-    bunch = _bunches(points)  # [B, 64] indices
-    members = points[bunch]
-    middle = (members.min(1) + members.max(1)) / 2
-    radius = np.linalg.norm(members - middle[:, None], axis=-1).max(1)
-    face = np.zeros(bunch.shape, np.int64)
-    step = max(1, min(len(bunch), 16 * BLOCK // len(corners)))
-    for start in range(0, len(bunch), step):
-        rows = slice(start, start + step)
-        reach = np.asarray(_reach(_padded(middle[rows].astype(np.float32), step), corners))[: len(middle[rows])]
-        near = reach <= reach.min(1, keepdims=True) + 2 * radius[rows, None] + 1e-6
-        face[rows] = _best_of(members[rows].astype(np.float32), near, corners)
+    corners = mesh.corners
+    reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
+    middle = (corners.min(1) + corners.max(1)) / 2
+    radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + 1e-9
     best = np.empty(len(points), np.int64)
-    best[bunch] = face
-    weight = _barycentric(points, *np.moveaxis(mesh.corners[best], 1, 0))
+    step = max(1, BLOCK // len(corners))
+    for start in range(0, len(points), step):
+        some = points[start : start + step]
+        row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
+        candidate = corners[face]
+        weight = _barycentric(some[row], *np.moveaxis(candidate, 1, 0))
+        gap = np.sum((np.einsum("pc,pcd->pd", weight, candidate) - some[row]) ** 2, -1)
+        order = np.lexsort((gap, row))
+        first = np.searchsorted(row[order], np.arange(len(some)))
+        best[start : start + step] = face[order[first]]
+    weight = _barycentric(points, *np.moveaxis(corners[best], 1, 0))
     zero = weight <= 1e-12
     feature = np.where(zero.sum(1) == 0, 0, np.where(zero.sum(1) == 1, 1 + zero.argmax(1), 4 + weight.argmax(1)))
-    return np.einsum("pc,pcd->pd", weight, mesh.corners[best]), mesh.pseudo_normals[best, feature]
-
-
-def _bunches(points: np.ndarray) -> np.ndarray:
-    """Indices [B, 64] of neighbouring points; every point is in one, the last bunch repeats a point."""
-    low = points.min(0)
-    cell = np.floor((points - low) / (np.ptp(points, axis=0).max() * 1.0001 + 1e-12) * 16).astype(np.int64)
-    order = np.argsort((cell[:, 0] * 16 + cell[:, 1]) * 16 + cell[:, 2], kind="stable")
-    return _padded(order, -(-len(order) // _BUNCH) * _BUNCH).reshape(-1, _BUNCH)
-
-
-def _padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """`rows` with the last one repeated, so that compiled code sees few shapes."""
-    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
-
-
-def _best_of(points: np.ndarray, near: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """The nearest triangle [B, 64] to points [B, 64, 3] of those allowed by near [B, T], 32 candidates at a time."""
-    count = near.sum(1)
-    order = np.argsort(-count, kind="stable")  # bunches with as many candidates together
-    face = np.zeros(points.shape[:2], np.int64)
-    for start in range(0, len(order), _BATCH):
-        rows = order[start : start + _BATCH]
-        chunks = -(-int(count[rows[0]]) // _CHUNK)
-        candidate = np.zeros((_BATCH, chunks * _CHUNK), np.int64)
-        for k, row in enumerate(rows):
-            found = np.flatnonzero(near[row])
-            candidate[k, : len(found)] = found
-            candidate[k, len(found) :] = found[0]
-        some = _padded(points[rows], _BATCH)
-        best, gap = np.zeros(some.shape[:2], np.int64), np.full(some.shape[:2], np.inf, np.float32)
-        for part in np.split(candidate, chunks, axis=1):
-            found, which = (np.asarray(x) for x in _closest(some, corners[part]))
-            better = found < gap
-            gap = np.where(better, found, gap)
-            best = np.where(better, np.take_along_axis(part, which, 1), best)
-        face[rows] = best[: len(rows)]
-    return face
-
-
-@jax.jit
-def _reach(points: jax.Array, corners: jax.Array) -> jax.Array:
-    """Distances [B, T] of points [B, 3] from triangles [T, 3, 3]."""
-    return jnp.sqrt(_squared(points[:, None], corners[None]))
-
-
-@jax.jit
-def _closest(points: jax.Array, corners: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Squared distance [B, Q] of points [B, Q, 3] from the nearest of triangles [B, K, 3, 3], and which it is."""
-    squared = _squared(points[:, :, None], corners[:, None])
-    return jnp.min(squared, -1), jnp.argmin(squared, -1)
-
-
-def _squared(point: jax.Array, corners: jax.Array) -> jax.Array:
-    """Squared distance [...] of points [..., 3] from triangles [..., 3, 3]: the least of face and edges."""
-
-    def dot(x, y):
-        return x[..., 0] * y[..., 0] + x[..., 1] * y[..., 1] + x[..., 2] * y[..., 2]
-
-    def cross(x, y):
-        (a, b, c), (d, e, f) = (tuple(v[..., k] for k in range(3)) for v in (x, y))
-        return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d], -1)
-
-    normal = cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
-    edges, inside = [], True
-    for k in range(3):
-        start, edge = corners[..., k, :], corners[..., (k + 1) % 3, :] - corners[..., k, :]
-        arm = point - start
-        t = jnp.clip(dot(arm, edge) / jnp.maximum(dot(edge, edge), 1e-30), 0.0, 1.0)
-        off = arm - t[..., None] * edge
-        edges.append(dot(off, off))
-        inside = inside & (dot(cross(normal, edge), arm) > 0)
-    height = dot(normal, point - corners[..., 0, :])
-    face = height**2 / jnp.maximum(dot(normal, normal), 1e-30)
-    nearest_edge = jnp.minimum(jnp.minimum(edges[0], edges[1]), edges[2])
-    return jnp.where(inside, face, nearest_edge)
+    return np.einsum("pc,pcd->pd", weight, corners[best]), mesh.pseudo_normals[best, feature]
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

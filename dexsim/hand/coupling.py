@@ -49,16 +49,11 @@ def read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple
             raise AssetError(f"{what}: joint {names[0]!r} follows {names[1]!r}, which has no motor (see joints)")
         reference = model.qpos0[model.jnt_qposadr[[first, second]]]
         followers[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
-        _check_range(path, model, first, followers[first])
+        reach = np.sort(followers[first][1] * model.jnt_range[second] + followers[first][2])
+        low, high = model.jnt_range[first]
+        if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
+            raise AssetError(
+                f"{path}: joint {names[0]!r} has the range {low:.4g} to {high:.4g} rad, and {names[1]!r} takes it from "
+                f"{reach[0]:.4g} to {reach[1]:.4g}"
+            )
     return followers
-
-
-def _check_range(path: Path, model: Any, joint: int, follows: tuple[int, float, float]) -> None:
-    motor, ratio, offset = follows
-    reach = np.sort(ratio * model.jnt_range[motor] + offset)
-    low, high = model.jnt_range[joint]
-    if model.jnt_limited[joint] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
-        raise AssetError(
-            f"{path}: joint {model.joint(joint).name!r} has the range {low:.4g} to {high:.4g} rad, and "
-            f"{model.joint(motor).name!r} takes it from {reach[0]:.4g} to {reach[1]:.4g}"
-        )

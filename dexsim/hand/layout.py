@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -61,16 +60,12 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
       kind: "rect", or "hex" with every other row shifted by half a pitch and rows sqrt(3)/2 pitches apart.
 
     Raises:
-      ConfigError: no taxels, no pitch or an unknown kind.
+      ConfigError: an unknown kind.
     """
-    across, along = (pitch, pitch) if isinstance(pitch, (int, float)) else pitch
     if kind not in ("rect", "hex"):
         raise ConfigError(f"lattice kind {kind!r}: choose rect or hex")
-    if columns < 1 or rows < 1 or not (across > 0 and along > 0):
-        raise ConfigError(f"lattice of {columns} x {rows} at a pitch of {pitch} m: all must be above 0")
+    across, along = (pitch, pitch) if isinstance(pitch, (int, float)) else pitch
     if kind == "hex":
-        if across != along:
-            raise ConfigError(f"hex lattice: one pitch expected, got {pitch}")
         along = across * np.sqrt(3) / 2
     column, row = (x.ravel() for x in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
     shift = 0.25 * np.where(row % 2, 1, -1) if kind == "hex" else 0.0
@@ -88,18 +83,14 @@ def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: 
     shrink with them.
 
     Raises:
-      ConfigError: an unknown kind, no radius, or a lattice that does not fit on the surface.
+      ConfigError: an unknown kind, or a lattice that does not fit on the surface.
     """
     u, v = points.u, points.v
-    if kind == "plane":
-        position = np.stack([u, v, 0 * u], -1)
-        return Patch(
-            points.grid, position, np.broadcast_to([0.0, 0.0, 1.0], position.shape).copy(), np.full(len(u), points.cell)
-        )
     if kind not in SURFACES:
         raise ConfigError(f"surface {kind!r}: choose from {', '.join(SURFACES)}")
-    if radius <= 0:
-        raise ConfigError(f"surface {kind!r}: radius = {radius} m, must be above 0")
+    if kind == "plane":
+        normal = np.tile([0.0, 0.0, 1.0], (len(u), 1))
+        return Patch(points.grid, np.stack([u, v, 0 * u], -1), normal, np.full(len(u), points.cell))
     angle = u / radius
     if np.ptp(u) >= 2 * np.pi * radius:
         raise ConfigError(
@@ -125,24 +116,17 @@ def on_mesh(mesh: Any, points: Lattice, *, origin: Any, facing: Any, along: Any)
     Raises:
       AssetError: a ray misses the mesh or grazes it (below 10 degrees).
     """
-    facing, along = _direction(facing), np.asarray(along, float)
-    along = _direction(along - (along @ facing) * facing)
+    facing, along = _unit(np.asarray(facing, float)), np.asarray(along, float)
+    along = _unit(along - (along @ facing) * facing)
     start = np.asarray(origin, float) + points.u[:, None] * np.cross(along, facing) + points.v[:, None] * along
     position, face = _first_hit(mesh.corners, start, -facing)
-    rows = points.grid[1]
-    if np.any(face < 0):
-        bad = int(np.argmax(face < 0))
-        raise AssetError(
-            f"{mesh.name}: the ray of taxel column {bad // rows}, row {bad % rows} misses the mesh "
-            f"({np.sum(face < 0)} of {len(face)} do); make the lattice smaller or move its origin"
-        )
     normal = mesh.normals[face]
-    cosine = normal @ facing
+    cosine = np.where(face < 0, 0.0, normal @ facing)
     if np.any(cosine < np.sin(np.radians(10))):
-        bad = int(cosine.argmin())
+        column, row = divmod(int(cosine.argmin()), points.grid[1])
         raise AssetError(
-            f"{mesh.name}: the surface under taxel column {bad // rows}, row {bad % rows} is too steep "
-            "for this direction; turn `facing` or make the lattice smaller"
+            f"{mesh.name}: the ray of taxel column {column}, row {row} misses the mesh or grazes it; make the lattice "
+            "smaller, move its origin or turn `facing`"
         )
     return Patch(points.grid, position, normal, points.cell / cosine)
 
@@ -212,7 +196,7 @@ def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
     """Write the taxels of named fingers (or links) as a layout file, whole or not at all; all must have the same grid.
 
     Raises:
-      ConfigError: grids differ, or a normal, an area or a position is none.
+      ConfigError: grids differ.
       OSError: the file cannot be written.
     """
     if len({patch.grid for patch in patches.values()}) != 1:
@@ -221,105 +205,54 @@ def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
     out = csv.writer(text, lineterminator="\n")
     out.writerow(COLUMNS)
     for name, patch in patches.items():
-        sound = np.abs(np.linalg.norm(patch.normal, axis=-1) - 1) <= 1e-3
-        if not (sound.all() and np.all(patch.area > 0) and np.isfinite(patch.position).all()):
-            raise ConfigError(f"layout {name!r}: normals must be of length 1, areas above 0 and positions finite")
-        for index in range(len(patch.position)):
-            column, row = divmod(index, patch.grid[1])
-            out.writerow(
-                [
-                    name,
-                    column,
-                    row,
-                    *(f"{x:.6f}" for x in patch.position[index]),
-                    *(f"{x:.6f}" for x in patch.normal[index]),
-                    f"{patch.area[index]:.6g}",
-                ]
-            )
+        for index, (position, normal, area) in enumerate(zip(patch.position, patch.normal, patch.area, strict=True)):
+            place = [f"{x:.6f}" for x in (*position, *normal)]
+            out.writerow([name, *divmod(index, patch.grid[1]), *place, f"{area:.6g}"])
     path = Path(path)
     write_whole(path, [text.getvalue().encode()])
     return path
 
 
-def read_layout(path: str | Path) -> dict[str, Patch]:
-    """The patches of a layout file by finger, in the file's order; the grid is found from its columns and rows.
+def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
+    """The taxels [F, N, 7] of a layout file: position, normal, area. Every finger must have columns * rows of them.
 
     Raises:
       AssetError: missing or broken file, with the line.
     """
-    path = Path(path)
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            entries = list(csv.DictReader(file))
-        if not entries:
-            raise ValueError("no taxels")
-        fingers = tuple(dict.fromkeys(entry["finger"] for entry in entries))
-        columns, rows = (1 + max(int(entry[name]) for entry in entries) for name in ("column", "row"))
-        if max(columns, rows) > MOST:
-            raise ValueError(f"{columns} x {rows} taxels")
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise AssetError(f"{path}: not a taxel layout ({error})") from None
-    table = read_taxels(path, fingers, (columns, rows)).astype(np.float64)
-    return {
-        name: Patch((columns, rows), taxels[:, 0:3], taxels[:, 3:6], taxels[:, 6])
-        for name, taxels in zip(fingers, table, strict=True)
-    }
-
-
-def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
-    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
-    columns, length = grid
-    expected = len(fingers) * columns * length
+    columns, rows = grid
+    table = np.full((len(fingers), columns, rows, 7), np.nan, np.float32)
+    line = 1
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a CSV with a byte order mark
             reader = csv.DictReader(file)
             if tuple(reader.fieldnames or ()) != COLUMNS:
-                raise AssetError(f"{path}: the first line must read {','.join(COLUMNS)}")
-            rows = [(reader.line_num, entry) for entry in itertools.islice(reader, expected + 1)]
+                raise ValueError(f"the first line must read {','.join(COLUMNS)}")
+            for entry in reader:
+                line = reader.line_num
+                if entry["finger"] not in fingers:
+                    raise ValueError(f"no finger {entry['finger']!r:.60}; the hand has {', '.join(fingers)}")
+                place = fingers.index(entry["finger"]), int(entry["column"]), int(entry["row"])
+                values = np.array([float(entry[name]) for name in COLUMNS[3:]])
+                if not 0 <= place[1] < columns or not 0 <= place[2] < rows:
+                    raise ValueError(f"column {place[1]}, row {place[2]} is outside the {columns} x {rows} grid")
+                if not abs(np.linalg.norm(values[3:6]) - 1) <= 0.01 or not _SMALLEST <= values[6] <= _LARGEST:
+                    raise ValueError(f"the normal must be of length 1, the area above 0 and at most {_LARGEST:g} m^2")
+                table[place] = values
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (OSError, ValueError, csv.Error) as error:
-        raise AssetError(f"{path}: {error}") from None
-    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
-    for line, entry in rows:
-        if entry["finger"] not in fingers:
-            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r:.60}; the hand has {', '.join(fingers)}")
-        try:
-            column, at = int(entry["column"]), int(entry["row"])
-            values = [float(entry[name]) for name in COLUMNS[3:]]
-            if None in entry:  # more values than columns
-                raise ValueError
-        except (TypeError, ValueError):
-            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
-        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.abs(values) < 1e6):  # NaN is not
-            raise AssetError(
-                f"{path}:{line}: column {column}, row {at} or a number in the line "
-                f"is outside the {columns} x {length} grid or not finite"
-            )
-        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or not _SMALLEST <= values[6] <= _LARGEST:
-            raise AssetError(
-                f"{path}:{line}: the normal must be of length 1 and the area above 0 and at most {_LARGEST:g} m^2"
-            )
-        table[fingers.index(entry["finger"]), column * length + at] = values
-    if len(rows) > expected:
-        raise AssetError(f"{path}: {len(rows)} taxels or more, expected {expected}: a column and row is given twice")
-    count = np.sum(np.isfinite(table[..., 0]), axis=1)
-    if np.any(count != columns * length):
+    except (OSError, TypeError, ValueError, csv.Error) as error:
+        raise AssetError(f"{path}:{line}: {error}") from None
+    count = np.sum(np.isfinite(table).all(-1), axis=(1, 2))
+    if np.any(count != columns * rows):
         worst = int(np.argmin(count))
         raise AssetError(
-            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
+            f"{path}: finger {fingers[worst]!r} has {count[worst]} sound taxels, the grid asks for {columns * rows}"
         )
-    return table
+    return table.reshape(len(fingers), -1, 7)
 
 
-def _direction(vector: Any) -> np.ndarray:
-    vector = np.asarray(vector, float)
-    length = np.linalg.norm(vector)
-    if not np.isfinite(length) or length < 1e-9:
-        raise ConfigError(f"direction {vector.tolist()}: must have a length")
-    return vector / length
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
 
 
 def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

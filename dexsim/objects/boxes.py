@@ -10,11 +10,7 @@ to the mesh near its surface.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import hashlib
-import io
-import warnings
 from collections.abc import Sequence
 
 import jax
@@ -22,9 +18,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.core.assets import cache_path
-from dexsim.core.errors import AssetError, DexsimWarning
-from dexsim.core.files import write_whole
+from dexsim.core.assets import cached_arrays
+from dexsim.core.errors import AssetError
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import rotations, sdf
 
@@ -33,7 +28,6 @@ _VOXELS = 28  # along the longest side
 _SEEDS = 120  # boxes grown for every one that is kept
 _STEPS = 400  # of the refinement
 _ALIKE = 0.002  # fits whose mean deviations differ by less, as a share of the mesh's size, are as good
-_MANY = 30_000  # triangles that take long to fit
 _WORST = (0.025, 0.1)  # largest deviation, mean and 99th percentile, as a share of the mesh's size
 
 
@@ -58,8 +52,8 @@ class Boxes:
         )
 
 
-def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (), cache: bool = True) -> Boxes:
-    """At most `parts` boxes for a mesh; what was fitted once is kept on disk.
+def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = ()) -> Boxes:
+    """At most `parts` boxes for a mesh; what was fitted once is kept in the cache.
 
     Args:
       frames: rotations [3, 3] whose columns boxes may start along, in addition to the mesh's own axes;
@@ -70,26 +64,9 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
         percentile), or its inside cannot be determined.
     """
     frames = (np.eye(3), *frames)
-    named = f"{mesh.fingerprint} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
-    key = hashlib.sha256(named.encode()).hexdigest()[:32]
-    path = cache_path("boxes") / f"{key}.npz"
-    boxes = _load(path) if cache else None
-    if boxes is None:
-        if len(mesh.faces) > _MANY:
-            warnings.warn(
-                f"{mesh.name}: {len(mesh.faces)} triangles, so that the first fit of boxes takes long; a "
-                "mesh simplified to some thousands gives nearly the same boxes",
-                DexsimWarning,
-                stacklevel=2,
-            )
-        boxes = _fit(mesh, parts, frames)
-        if cache:
-            buffer = io.BytesIO()
-            np.savez(
-                buffer, size=boxes.size, position=boxes.position, quat=boxes.quat, deviation=np.array(boxes.deviation)
-            )
-            with contextlib.suppress(OSError):
-                write_whole(path, [buffer.getbuffer()])
+    key = f"{mesh.fingerprint} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
+    arrays = cached_arrays("boxes", key, lambda: vars(_fit(mesh, parts, frames)))
+    boxes = Boxes(arrays["size"], arrays["position"], arrays["quat"], tuple(map(float, arrays["deviation"])))
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
         mean, worst = (1e3 * off for off in boxes.deviation)
@@ -101,26 +78,14 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
     return boxes
 
 
-def _load(path) -> Boxes | None:
-    try:
-        with np.load(path) as file:
-            return Boxes(file["size"], file["position"], file["quat"], tuple(map(float, file["deviation"])))
-    except Exception:  # missing, damaged, of an older program: fit again
-        return None
-
-
 def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     meshes.check_sign(mesh)
     rng = np.random.default_rng(0)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     skin, normal, _ = meshes.sample_surface(mesh, 3000, rng)
     low, high = mesh.bounds + [[-0.03 * extent], [0.03 * extent]]
-    points = np.concatenate(
-        [
-            skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal,
-            rng.uniform(low, high, (1500, 3)),
-        ]
-    )
+    near = skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal
+    points = np.concatenate([near, rng.uniform(low, high, (1500, 3))])
     distance, _ = meshes.signed_distance(mesh, points)
     candidates = []
     for frame in frames:
@@ -163,7 +128,7 @@ def _grow(mesh: meshes.Mesh, parts: int, rng: np.random.Generator) -> tuple[np.n
             f"a mesh of {1000 * float((high - low).max()):.0f} mm has no inside at a resolution of {1000 * pitch:.1f} "
             "mm: its walls are too thin for boxes; give it as a solid"
         )
-    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    boxes: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(parts):
         if left.sum() < 0.01 * inside.sum():
             break
@@ -173,8 +138,8 @@ def _grow(mesh: meshes.Mesh, parts: int, rng: np.random.Generator) -> tuple[np.n
         gain = [int(np.sum(left[_cut(box)])) - int(np.sum(~inside[_cut(box)])) for box in grown]
         best = grown[int(np.argmax(gain))]
         left[_cut(best)] = False
-        kept.append(best)
-    corners = np.array(kept)
+        boxes.append(best)
+    corners = np.array(boxes)
     return low + corners[:, 0] * cell, low + corners[:, 1] * cell
 
 
@@ -206,14 +171,11 @@ def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) ->
 
 def _union(params: dict[str, jax.Array], points: jax.Array) -> jax.Array:
     quat = params["quat"] / jnp.linalg.norm(params["quat"], axis=-1, keepdims=True)
-    return jnp.min(
-        jax.vmap(
-            lambda position, size, quat: sdf.box(
-                sdf.to_local(points, position, rotations.quat_to_matrix(quat)), jnp.exp(size)
-            )
-        )(params["position"], params["size"], quat),
-        0,
-    )
+
+    def one(position: jax.Array, size: jax.Array, quat: jax.Array) -> jax.Array:
+        return sdf.box(sdf.to_local(points, position, rotations.quat_to_matrix(quat)), jnp.exp(size))
+
+    return jnp.min(jax.vmap(one)(params["position"], params["size"], quat), 0)
 
 
 @jax.jit
@@ -251,11 +213,8 @@ def _boxes(mesh: meshes.Mesh, params: dict[str, jax.Array], rng: np.random.Gener
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     size, position = np.exp(np.asarray(params["size"], np.float64)), np.asarray(params["position"], np.float64)
     boxes = Boxes(size.astype(np.float32), position.astype(np.float32), quat.astype(np.float32), (0.0, 0.0))
-    there = np.abs(
-        np.asarray(
-            sdf.signed_distance(jnp.asarray(meshes.sample_surface(mesh, 2000, rng)[0], jnp.float32), boxes.shape())
-        )
-    )
+    skin = jnp.asarray(meshes.sample_surface(mesh, 2000, rng)[0], jnp.float32)
+    there = np.abs(np.asarray(sdf.signed_distance(skin, boxes.shape())))
     back = np.abs(meshes.signed_distance(mesh, _on_surface(boxes, 2000, rng))[0])
     both = np.concatenate([there, back])
     return dataclasses.replace(boxes, deviation=(float(both.mean()), float(np.percentile(both, 99))))

@@ -10,7 +10,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dexsim.geometry import mesh as meshes
@@ -62,8 +61,8 @@ def from_mesh(mesh: meshes.Mesh, parts: int) -> MeshObject:
     """The object of a mesh that has been checked; see `load`."""
     import trimesh
 
-    known = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
-    tensor, origin = np.asarray(known.inertia) / known.mass, np.asarray(known.center_mass)
+    properties = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
+    tensor, origin = np.asarray(properties.inertia) / properties.mass, np.asarray(properties.center_mass)
     axes = principal_axes(tensor)
     own = meshes.Mesh(mesh.name, (mesh.vertices - origin) @ axes, mesh.faces)
     inertia = np.diag(axes.T @ tensor @ axes).astype(np.float32)
@@ -87,9 +86,3 @@ def principal_axes(tensor: np.ndarray) -> np.ndarray:
         return axes
 
     return max(map(turned, itertools.permutations(range(3))), key=np.trace)
-
-
-def scaled_boxes(mesh_object: MeshObject, factor: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Sizes [K, 3] m, places [K, 3] m and orientations [K, 4] of its boxes at `factor` times its size."""
-    boxes = mesh_object.boxes
-    return factor * jnp.asarray(boxes.size), factor * jnp.asarray(boxes.position), jnp.asarray(boxes.quat)

@@ -28,17 +28,14 @@ from dexsim.objects.config import (
     load_mesh_object,
     nominal,
 )
-from dexsim.objects.mesh import scaled_boxes
 
 
 def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
     """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
     radius = {
-        "sphere": lambda s: s[0],
         "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
         "capsule": lambda s: s[0] + s[1],
         "cylinder": lambda s: jnp.hypot(s[0], s[1]),
-        "ellipsoid": jnp.max,
     }
     return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
 
@@ -109,38 +106,28 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
       AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
     config, keys, extreme = config.narrowed(), jax.random.split(key, 8), sample_extreme(key, config.extremes)
+    zero, three, quat = jnp.zeros(()), jnp.zeros(3), None
     if config.mesh:
-        return _sample_mesh(keys, config, extreme)
-    if shape_index is None:
-        allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
-        shape_index = jax.random.choice(keys[0], allowed)
-    size, position, active = _sample_slots(keys[1], shape_index, config, extreme)
-    kept = np.array([SLOTS.index(slot) for slot in config.slots])  # a mesh, which has slots of its own, is not here
-    size, position, active = size[kept], position[kept], active[kept]
-    density_mass, com, inertia = _mass_properties(config.slots, size, position, active)
-    position = position - com[None]  # the origin is the centre of a uniform solid
-    object = _bare(shape_index.astype(jnp.int32), size, position, active, extreme)
-    object = dataclasses.replace(object, kinds=config.slots)
-    return _with_bulk(object, inertia / density_mass, _sample_bulk(keys, config, extreme))
-
-
-def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> ObjectParams:
-    mesh_object = load_mesh_object(config)
-    factor = uniform(keys[1], config.mesh_size, extreme)
-    size, position, quat = scaled_boxes(mesh_object, factor)
-    object = _bare(jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), extreme)
-    object = dataclasses.replace(object, quat=quat, kinds=mesh_object.kinds)
-    return _with_bulk(object, factor**2 * jnp.asarray(mesh_object.inertia), _sample_bulk(keys, config, extreme))
-
-
-def _bare(
-    shape_index: jax.Array, size: jax.Array, position: jax.Array, active: jax.Array, extreme: jax.Array | None
-) -> ObjectParams:
-    """An object that is a shape so far."""
-    zero, three = jnp.zeros(()), jnp.zeros(3)
-    return ObjectParams(
-        shape_index, size, position, active, zero, three, three, zero, jnp.zeros(2), link_friction=zero, extreme=extreme
+        mesh_object = load_mesh_object(config)
+        boxes, factor = mesh_object.boxes, uniform(keys[1], config.mesh_size, extreme)
+        size, position = factor * jnp.asarray(boxes.size), factor * jnp.asarray(boxes.position)
+        quat, active = jnp.asarray(boxes.quat), jnp.ones(len(size), bool)
+        shape_index, kinds = jnp.int32(KINDS.index("mesh")), mesh_object.kinds
+        plain = factor**2 * jnp.asarray(mesh_object.inertia)
+    else:
+        if shape_index is None:
+            allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
+            shape_index = jax.random.choice(keys[0], allowed)
+        shape_index, kinds = shape_index.astype(jnp.int32), config.slots
+        slots = np.array([SLOTS.index(slot) for slot in kinds])
+        size, position, active = (part[slots] for part in _sample_slots(keys[1], shape_index, config, extreme))
+        mass, com, inertia = _mass_properties(kinds, size, position, active)
+        position = position - com[None]  # the origin is the centre of a uniform solid
+        plain = inertia / mass
+    object = ObjectParams(
+        shape_index, size, position, active, zero, three, three, zero, jnp.zeros(2), quat, zero, kinds, extreme
     )
+    return _with_bulk(object, plain, _sample_bulk(keys, config, extreme))
 
 
 # --- bulk: what an object is beside its shape, by the names of `BULK_RANGES` ---------------------
@@ -159,8 +146,8 @@ def redraw_bulk(
       names: the ranges, of `BULK_RANGES`, that are drawn.
     """
     drawn = _sample_bulk(jax.random.split(key, 8), config.narrowed(), object.extreme)
-    kept = _bulk_of(object, plain)
-    return _with_bulk(object, plain, {name: (drawn if name in names else kept)[name] for name in kept})
+    bulk = _bulk_of(object, plain)
+    return _with_bulk(object, plain, bulk | {name: drawn[name] for name in names})
 
 
 def _sample_bulk(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:

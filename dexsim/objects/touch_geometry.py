@@ -11,7 +11,7 @@ from dexsim.geometry.distance import METHODS
 from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams
 
-TOUCH_METHODS = tuple(METHODS)
+TOUCH_METHODS = METHODS
 
 
 def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:

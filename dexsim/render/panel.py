@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -78,26 +79,18 @@ def _font(size: int):
     return ImageFont.load_default(size)
 
 
-@lru_cache(maxsize=4)
-def _background(layout: Layout, names: tuple[str, ...], force_range: float):
-    """What stays the same in every frame of a video."""
-    from PIL import Image, ImageDraw
+def _draw_scale(layout: Layout, image: Any, draw: Any, force_range: float) -> None:
+    """The colour scale at the bottom of the read-outs' block."""
+    from PIL import Image
 
-    image = Image.new("RGB", (layout.width, layout.height), PANEL)
-    draw = ImageDraw.Draw(image)
     width = layout.cell * layout.grid[0] - _GAP
-    for (x, y), name in zip(layout.slots[:-1], names, strict=True):
-        draw.text((x, y), name, fill=INK, font=_font(layout.font))
     x, y = layout.slots[-1]
-    bottom = y + int(1.3 * layout.font) + layout.cell * layout.grid[1]
     small, bar = _font(layout.font - 2), max(4, layout.cell)
-    top = bottom - bar - int(1.3 * layout.font)
+    top = y + layout.cell * layout.grid[1] - bar
     scale = force_color(np.linspace(0, force_range, width)[None].repeat(bar, 0), force_range)
     image.paste(Image.fromarray(scale), (x, top))
     draw.text((x, top + bar + 3), "0", fill=FAINT, font=small)
-    label = f"{force_range:.2g} N / taxel"
-    draw.text((x + width - draw.textlength(label, small), top + bar + 3), label, fill=FAINT, font=small)
-    return image
+    draw.text((x + width, top + bar + 3), f"{force_range:.2g} N / taxel", fill=FAINT, font=small, anchor="ra")
 
 
 def draw_panel(
@@ -118,15 +111,16 @@ def draw_panel(
     """
     from PIL import Image, ImageDraw
 
-    image = _background(layout, tuple(names), float(force_range)).copy()
+    image = Image.new("RGB", (layout.width, layout.height), PANEL)
     draw = ImageDraw.Draw(image)
+    _draw_scale(layout, image, draw, force_range)
     font, pad = _font(layout.font), int(1.3 * layout.font)
     width, height = layout.cell * layout.grid[0] - _GAP, layout.cell * layout.grid[1]
     colors = np.where(taxel_force[..., None] > 0, force_color(taxel_force, force_range), np.array(EMPTY, np.uint8))
     grid = np.arange(layout.cell) >= layout.cell - _GAP
     for f, (x, y) in enumerate(layout.slots[:-1]):
-        text = f"{finger_force[f]:.1f} N"
-        draw.text((x + width - draw.textlength(text, font), y), text, fill=INK, font=font)
+        draw.text((x, y), names[f], fill=INK, font=font)
+        draw.text((x + width, y), f"{finger_force[f]:.1f} N", fill=INK, font=font, anchor="ra")
         cells = taxel_image(colors[f], layout.grid).repeat(layout.cell, 0).repeat(layout.cell, 1)
         cells[np.tile(grid, layout.grid[1])] = PANEL
         cells[:, np.tile(grid, layout.grid[0])] = PANEL
@@ -168,12 +162,3 @@ def read_outs(snapshot: Snapshot) -> dict[str, str]:
         if np.isfinite(snapshot.target_force):
             lines["target"] = f"{float(snapshot.target_force):.1f} N"
     return lines | {"total": f"{np.sum(snapshot.finger_force):.1f} N"}
-
-
-def write_label(picture: np.ndarray, at: np.ndarray, text: str) -> np.ndarray:
-    """A picture uint8 [H, W, 3] with a word centred at a pixel (x, y)."""
-    from PIL import Image, ImageDraw
-
-    image = Image.fromarray(picture)
-    ImageDraw.Draw(image).text(tuple(at), text, fill=INK, font=_font(max(8, len(picture) // 36)), anchor="mm")
-    return np.asarray(image)

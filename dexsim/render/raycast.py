@@ -1,9 +1,9 @@
 """Pictures of posed primitives by ray casting in NumPy: no OpenGL, no display, the same picture on every machine.
 
 Every pixel's ray is intersected in closed form with each primitive inside that primitive's bounding box on the
-screen, so silhouettes and normals are exact and nothing is tessellated. The ray of pixel (x, y) in a primitive's own
-frame is affine in x and y, which makes a primitive a handful of array operations. Sizes follow MuJoCo: box
-half-extents; capsule and cylinder (radius, half_length, -) along z; sphere (radius, -, -); ellipsoid semi-axes.
+screen. The ray of pixel (x, y) in a primitive's own frame is affine in x and y, which makes a primitive a handful of
+array operations. Sizes follow MuJoCo: box half-extents; capsule and cylinder (radius, half_length, -) along z;
+sphere (radius, -, -); ellipsoid semi-axes.
 """
 
 from __future__ import annotations
@@ -39,10 +39,8 @@ class CameraView(NamedTuple):
 
     origin: np.ndarray  # [3], m
     axes: np.ndarray  # [3, 3]
-    scale: float  # pixels per unit slope (perspective) or per metre (orthographic)
-    centre: tuple[float, float]  # pixel of the optical axis
-    size: tuple[int, int]  # width, height
-    orthographic: bool = False
+    scale: float  # pixels per unit slope
+    size: tuple[int, int]  # width, height; the optical axis is in the middle
 
 
 class Primitives(NamedTuple):
@@ -64,19 +62,6 @@ class VisibleSurface:
     index: np.ndarray  # [H, W] int, primitive, -1 where empty
 
 
-@dataclass(frozen=True, eq=False)
-class ShadingSamples:
-    """Surface points to shade, those of one primitive together.
-
-    Components are the first axis: NumPy is several times faster on three long rows than on many short triples.
-    """
-
-    pixel: np.ndarray  # [M] int, flat number in the picture
-    weight: np.ndarray  # [M], share of the pixel
-    index: np.ndarray  # [M] int, primitive
-    points: np.ndarray  # [3, M], m
-
-
 def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> CameraView:
     """The view of `camera` for a picture of `size` (width, height), with `supersample`² rays a pixel."""
     up = _unit(np.asarray(camera.up, np.float64))
@@ -91,22 +76,22 @@ def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> CameraV
     width, height = size[0] * supersample, size[1] * supersample
     scale = height / 2 / np.tan(np.deg2rad(camera.field_of_view) / 2)
     origin = np.asarray(camera.target, np.float64) + camera.distance * back
-    return CameraView(origin, axes, float(scale), (width / 2, height / 2), (width, height))
+    return CameraView(origin, axes, float(scale), (width, height))
 
 
 def project(view: CameraView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [..., 2] and depths [...] of points [..., 3]; pixel (i, j) covers [i, i+1) x [j, j+1), y down."""
     local = (np.asarray(points) - view.origin) @ view.axes.T
     depth = -local[..., 2]
-    scale = view.scale if view.orthographic else view.scale / np.maximum(depth, 1e-6)
-    return np.stack([view.centre[0] + local[..., 0] * scale, view.centre[1] - local[..., 1] * scale], -1), depth
+    scale = view.scale / np.maximum(depth, 1e-6)
+    width, height = view.size
+    return np.stack([width / 2 + local[..., 0] * scale, height / 2 - local[..., 1] * scale], -1), depth
 
 
 def cast(primitives: Primitives, view: CameraView) -> VisibleSurface:
     """The nearest primitive along every ray of the view."""
-    width, height = view.size
-    depth = np.full((height, width), FAR, np.float32)
-    index = np.full((height, width), -1, np.int16)
+    depth = np.full(view.size[::-1], FAR, np.float32)
+    index = np.full(view.size[::-1], -1, np.int32)
     for g, (kind, box) in enumerate(zip(primitives.kind, screen_boxes(view, primitives), strict=True)):
         x0, x1, y0, y1 = box
         if x0 >= x1 or y0 >= y1:
@@ -117,124 +102,85 @@ def cast(primitives: Primitives, view: CameraView) -> VisibleSurface:
         window = depth[y0:y1, x0:x1]
         nearer = (hit < window) & (hit > 1e-3)
         np.copyto(window, hit, where=nearer)
-        np.copyto(index[y0:y1, x0:x1], np.int16(g), where=nearer)
+        np.copyto(index[y0:y1, x0:x1], g, where=nearer)
     return VisibleSurface(depth, index)
 
 
-def samples(view: CameraView, surface: VisibleSurface, n: int) -> ShadingSamples:
-    """Where to shade a surface cast with n x n rays a pixel: once a pixel inside a primitive, once a ray at an edge."""
-    indices = [surface.index[i::n, j::n] for i in range(n) for j in range(n)]
-    depths = [surface.depth[i::n, j::n] for i in range(n) for j in range(n)]
-    inside = indices[0] >= 0
-    for other in indices[1:]:
-        inside &= other == indices[0]
-    pixels = [np.flatnonzero(inside)]
-    parts = [indices[0].reshape(-1)[pixels[0]]]
-    ways = [np.asarray(sum(x.reshape(-1)[pixels[0]] for x in depths)) * np.float32(1 / n**2)]
-    shift = [(0.5 * n, 0.5 * n)]
-    for k, (some, far) in enumerate(zip(indices, depths, strict=True)):
-        pixels.append(np.flatnonzero((some >= 0) & ~inside))
-        parts.append(some.reshape(-1)[pixels[-1]])
-        ways.append(far.reshape(-1)[pixels[-1]])
-        shift.append((k % n + 0.5, k // n + 0.5))
-    counts = [len(part) for part in pixels]
-    index = np.concatenate(parts)
-    order = np.argsort(index, kind="stable")
-    pixel, depth = np.concatenate(pixels)[order].astype(np.int32), np.concatenate(ways)[order]
-    dx, dy = (np.repeat(np.array(values, np.float32), counts)[order] for values in zip(*shift, strict=True))
-    weight = np.repeat(np.array([1] + [1 / n**2] * n**2, np.float32), counts)[order]
-    row, column = np.divmod(pixel, np.int32(view.size[0] // n))
-    slope = np.float32(1 / view.scale) if view.orthographic else depth * np.float32(1 / view.scale)
-    x = (column * np.float32(n) + dx - np.float32(view.centre[0])) * slope
-    y = (np.float32(view.centre[1]) - row * np.float32(n) - dy) * slope
-    points = view.axes.T.astype(np.float32) @ np.stack([x, y, -depth]) + view.origin.astype(np.float32)[:, None]
-    return ShadingSamples(pixel, weight, index[order], points)
+def hit_points(view: CameraView, row: np.ndarray, column: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The points [M, 3] m that pixels [M] see at depths [M] m."""
+    width, height = view.size
+    ray = np.empty((len(row), 3), np.float32)
+    ray[:, 0] = (column + (0.5 - width / 2)) / view.scale
+    ray[:, 1] = (height / 2 - 0.5 - row) / view.scale
+    ray[:, 2] = -1.0
+    return (depth[:, None] * ray) @ view.axes.astype(np.float32) + view.origin.astype(np.float32)
 
 
-def normals(primitives: Primitives, index: np.ndarray, points: np.ndarray, bevel: float = 0.003) -> np.ndarray:
-    """Outward unit normals [3, M] at points [3, M] of primitives [M], sorted as in `ShadingSamples`.
-
-    Edges of boxes and cylinders are shaded as if rounded by `bevel` [m].
-    """
+def normals(primitives: Primitives, index: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Outward unit normals [M, 3] at points [M, 3] of primitives [M]; edges of boxes and cylinders look rounded."""
     result = np.empty_like(points)
-    edges = np.searchsorted(index, np.arange(len(primitives.kind) + 1))
-    for g, kind in enumerate(primitives.kind):
-        members = slice(edges[g], edges[g + 1])
-        rotation = primitives.rotation[g].astype(np.float32)
-        local = rotation.T @ (points[:, members] - primitives.position[g].astype(np.float32)[:, None])
-        size = primitives.size[g].astype(np.float32)
-        result[:, members] = rotation @ _local_normal(kind, local, size, np.float32(bevel))
-    return result / np.maximum(length(result), np.float32(1e-9))
+    order = np.argsort(index, kind="stable")
+    edges = np.searchsorted(index[order], np.arange(len(primitives.kind) + 1))
+    for g in np.unique(index):
+        members = order[edges[g] : edges[g + 1]]
+        turn, size = (part[g].astype(np.float32) for part in (primitives.rotation, primitives.size))
+        local = (points[members] - primitives.position[g].astype(np.float32)) @ turn
+        result[members] = _local_normal(primitives.kind[g], local, size) @ turn.T
+    return result / np.maximum(np.sqrt(np.einsum("mi,mi->m", result, result)), np.float32(1e-9))[:, None]
 
 
-def length(vectors: np.ndarray) -> np.ndarray:
-    """Lengths [M] of vectors [3, M]."""
-    return np.sqrt(vectors[0] * vectors[0] + vectors[1] * vectors[1] + vectors[2] * vectors[2])
-
-
-def _local_normal(kind: str, p: np.ndarray, size: np.ndarray, bevel: np.float32) -> np.ndarray:
-    if kind == "sphere":
-        return p
+def _local_normal(kind: str, p: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """How points [M, 3] of a primitive of this kind stand out from its core, in its own frame."""
     if kind == "ellipsoid":
-        return p / (size * size)[:, None]
-    if kind == "capsule":
-        return np.stack([p[0], p[1], p[2] - np.clip(p[2], -size[1], size[1])])
+        return p / size**2
     if kind == "box":
-        core = np.maximum(size - bevel, 0.5 * size)[:, None]
-        return p - np.clip(p, -core, core)
-    radius, half = (size[0], size[1])  # cylinder: the bevelled edge lies between its side and its caps
-    core_r, core_z = max(radius - bevel, 0.5 * radius), max(half - bevel, 0.5 * half)
-    outward = 1 - np.minimum(1, core_r / np.maximum(np.hypot(p[0], p[1]), np.float32(1e-9)))
-    return np.stack([p[0] * outward, p[1] * outward, p[2] - np.clip(p[2], -core_z, core_z)])
+        return p - np.clip(p, -0.9 * size, 0.9 * size)
+    core, half = np.zeros_like(p), size[1]
+    if kind == "capsule":
+        core[:, 2] = np.clip(p[:, 2], -half, half)
+    if kind == "cylinder":
+        core[:, :2] = p[:, :2] * np.minimum(1.0, 0.9 * size[0] / np.hypot(p[:, 0], p[:, 1]))[:, None]
+        core[:, 2] = np.clip(p[:, 2], -0.9 * half, 0.9 * half)
+    return p - core
 
 
 def screen_boxes(view: CameraView, primitives: Primitives) -> np.ndarray:
     """Pixel windows [G, 4] (x0, x1, y0, y1) that certainly hold the primitives; empty outside the picture."""
-    points = np.empty((len(primitives.kind), 16, 3))
-    for g, (kind, (a, b, c), turn) in enumerate(
-        zip(primitives.kind, primitives.size, primitives.rotation, strict=True)
-    ):
-        if kind in ("sphere", "capsule"):  # a cube along the camera's axes about each end is tighter than a turned box
-            end = b * turn[:, 2] if kind == "capsule" else np.zeros(3)
-            points[g, :8] = a * (_CORNERS @ view.axes) + end
-            points[g, 8:] = points[g, :8] - 2 * end
-        else:
-            points[g, :8] = points[g, 8:] = _CORNERS * ((a, a, b) if kind == "cylinder" else (a, b, c)) @ turn.T
-    pixels, depth = project(view, points + primitives.position[:, None])
+    size = primitives.size
+    reach = {
+        "sphere": size[:, 0],
+        "ellipsoid": size.max(-1, initial=0.0),
+        "capsule": size[:, 0] + size[:, 1],
+        "cylinder": np.hypot(size[:, 0], size[:, 1]),
+        "box": np.linalg.norm(size, axis=-1),
+    }
+    radius = np.array([reach[kind][g] for g, kind in enumerate(primitives.kind)])
+    local = (primitives.position - view.origin) @ view.axes.T
+    # Of a cube along the camera's axes: a point between its corners projects between theirs.
+    corners = local[:, None] + radius[:, None, None] * np.array([[x, x, z] for x in (-1, 1) for z in (-1, 1)])
+    nearest = -corners[..., 2].max(1)
+    slope = corners[..., :2] / np.maximum(-corners[..., 2:], 1e-3)
     limit = np.array(view.size)
-    low = np.clip(np.floor(np.nan_to_num(pixels.min(1), nan=0)), 0, limit).astype(int)
-    high = np.clip(np.ceil(np.nan_to_num(pixels.max(1), nan=0)), 0, limit).astype(int)
-    if not view.orthographic:
-        around = (depth.min(1) <= 1e-3) & (depth.max(1) > 0)  # reaches behind the camera: no bound is safe
-        low[around], high[around] = 0, limit
-        high[depth.max(1) <= 0] = 0
-    return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], -1)
-
-
-def crop(view: CameraView, primitives: Primitives, multiple: int) -> tuple[CameraView, tuple[slice, slice]]:
-    """The part of the view that holds the primitives, on multiples of `multiple` pixels, and its (rows, columns)."""
-    boxes = screen_boxes(view, primitives)
-    boxes = boxes[(boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3])]
-    if len(boxes) == 0:
-        boxes = np.zeros((1, 4), int)
-    x0, y0 = boxes[:, [0, 2]].min(0) // multiple * multiple
-    x1, y1 = -(-boxes[:, [1, 3]].max(0) // multiple) * multiple
-    centre = (view.centre[0] - x0, view.centre[1] - y0)
-    return view._replace(centre=centre, size=(int(x1 - x0), int(y1 - y0))), (slice(y0, y1), slice(x0, x1))
+    low, high = slope.min(1) * view.scale, slope.max(1) * view.scale
+    x0, x1 = low[:, 0] + limit[0] / 2, high[:, 0] + limit[0] / 2
+    y0, y1 = limit[1] / 2 - high[:, 1], limit[1] / 2 - low[:, 1]
+    boxes = np.stack([np.floor(x0), np.ceil(x1), np.floor(y0), np.ceil(y1)], -1)
+    boxes = np.clip(boxes, 0, limit.repeat(2)).astype(int)
+    boxes[nearest <= 1e-3] = [0, limit[0], 0, limit[1]]  # reaches behind the camera: no bound is safe
+    return boxes
 
 
 def _local_rays(
     view: CameraView, primitives: Primitives, g: int, box: tuple[int, int, int, int]
 ) -> tuple[tuple, tuple]:
-    """Origin and direction of each ray in the frame of primitive g, three components each (scalar or [h, w])."""
+    """Origin (three numbers) and direction (three arrays [h, w]) of each ray in the frame of primitive g."""
     x0, x1, y0, y1 = box
-    x = (np.arange(x0, x1, dtype=np.float32) + np.float32(0.5 - view.centre[0])) / np.float32(view.scale)
-    y = (np.float32(view.centre[1] - 0.5) - np.arange(y0, y1, dtype=np.float32)) / np.float32(view.scale)
+    width, height = view.size
+    x = ((np.arange(x0, x1) + 0.5 - width / 2) / view.scale).astype(np.float32)
+    y = ((height / 2 - 0.5 - np.arange(y0, y1)) / view.scale).astype(np.float32)
     turn = (view.axes @ primitives.rotation[g]).astype(np.float32)  # camera axes in the primitive's frame
     start = ((view.origin - primitives.position[g]) @ primitives.rotation[g]).astype(np.float32)
-    base = start if view.orthographic else -turn[2]
-    sweep = tuple((x * turn[0, k] + base[k])[None, :] + (y * turn[1, k])[:, None] for k in range(3))
-    return (sweep, tuple(-turn[2])) if view.orthographic else (tuple(start), sweep)
+    return tuple(start), tuple((x * turn[0, k] - turn[2, k])[None, :] + (y * turn[1, k])[:, None] for k in range(3))
 
 
 # Each of these takes a ray o + t d in the primitive's frame and returns the first t. Where the ray misses they return
@@ -294,7 +240,6 @@ def _box(o, d, size):
 
 
 _INTERSECT = {"sphere": _sphere, "ellipsoid": _ellipsoid, "capsule": _capsule, "cylinder": _cylinder, "box": _box}
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -4,12 +4,11 @@
 installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and matplotlib are imported when first used.
 """
 
-import contextlib
 import dataclasses
 import io
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,9 @@ from dexsim.core.files import write_whole
 from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
-from dexsim.render.panel import draw_panel, force_color, make_layout, read_outs, taxel_image, write_label
-from dexsim.render.picture import Pose, draw_scene, goal_position
-from dexsim.render.raycast import Camera, look, project
+from dexsim.render.panel import draw_panel, make_layout, read_outs, taxel_image
+from dexsim.render.picture import Pose, draw_scene
+from dexsim.render.raycast import Camera
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {
@@ -145,14 +144,11 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
     camera = _aimed(CAMERAS[camera], hand) if isinstance(camera, str) else camera
     layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
-    view = look(camera, (width - panel_width, height))
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
     finger_range = finger_range or float(np.nanmax(np.append(snapshot.finger_force, snapshot.target_force))) or 1.0
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
-        if frame.goal_rotation is not None:
-            scene = write_label(scene, project(view, goal_position(camera))[0] + (0, height // 11), "goal")
         panel = draw_panel(
             layout, hand.finger_names, frame.taxel_force, frame.finger_force, read_outs(frame),
             float(frame.target_force), force_range, finger_range,
@@ -193,31 +189,30 @@ def _finite(snapshot: Snapshot) -> Snapshot:
 
 
 def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float, size: tuple[int, int]) -> Path:
-    if path.suffix == ".gif":
-        return _write_gif(frame, count, path, fps)
     try:
+        if path.suffix == ".gif":
+            raise ImportError
         import imageio_ffmpeg
 
-        with _forks_quietly():
-            imageio_ffmpeg.get_ffmpeg_exe()
+        imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):  # the wheel of some platforms comes without the program
-        return _write_gif(frame, count, path.with_suffix(".gif"), fps)
+        return _write_gif([frame(t) for t in range(count)], path.with_suffix(".gif"), fps)
     path = path.with_suffix(".mp4")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        # The encoder is started by a fork that executes another program at once, which JAX's threads survive.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
         film = Path(folder) / "film.mp4"
         writer = imageio_ffmpeg.write_frames(
             str(film), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
             output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="quiet",
         )  # fmt: skip
         try:
-            with _forks_quietly():
-                writer.send(None)
+            writer.send(None)
             for t in range(count):
                 writer.send(np.ascontiguousarray(frame(t)))
             writer.close()
-            with _forks_quietly():  # The encoder ends in the same way on a full disk.
-                imageio_ffmpeg.count_frames_and_secs(str(film))
-        except (OSError, RuntimeError):  # Their text is the encoder's whole command.
+            imageio_ffmpeg.count_frames_and_secs(str(film))  # the encoder ends in the same way on a full disk
+        except (OSError, RuntimeError):  # their text is the encoder's whole command
             raise OSError(f"{path}: the film cannot be encoded in {folder} (is the disk full?)") from None
         finally:
             writer.close()
@@ -225,25 +220,13 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
     return path
 
 
-@contextlib.contextmanager
-def _forks_quietly() -> Iterator[None]:
-    """The encoder is started by a fork that executes another program at once, which JAX's threads survive."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        yield
-
-
-def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float) -> Path:
+def _write_gif(frames: list[np.ndarray], path: Path, fps: float) -> Path:
     from PIL import Image
 
-    # One palette for all frames: quantising to a given palette is fast and nothing flickers. A quarter of it is kept
-    # for the colours of force, which cover few pixels; the rest is drawn from frames throughout the video.
-    some = np.concatenate([frame(t) for t in np.linspace(0, count - 1, min(count, 5)).astype(int)])
-    quantized = Image.fromarray(some).quantize(192, Image.Quantize.MEDIANCUT)
-    scene = (quantized.getpalette() or [])[: 3 * 192]
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(scene + force_color(np.linspace(0, 1, 64), 1.0).reshape(-1).tolist())
-    images = [Image.fromarray(frame(t)).quantize(palette=palette, dither=Image.Dither.NONE) for t in range(count)]
+    # One palette for all frames, so that nothing flickers.
+    some = np.concatenate(frames[:: -(-len(frames) // 5)])
+    palette = Image.fromarray(some).quantize(256)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     buffer = io.BytesIO()
     images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
     write_whole(path, [buffer.getvalue()])

@@ -156,12 +156,12 @@ class TaxelArray:
           finger_gain: [F, 1], factor on all taxels of a finger.
         """
         sensor, late, walk = self.sensor, memory.late, memory.walk
-        value = felt = force * finger_gain
+        value = load = force * finger_gain
         # What is off is None in `params` and `memory` alike.
         if late is not None:
             assert params.memory is not None and params.hysteresis is not None
-            late = felt + params.memory * (late - felt)
-            value = value + params.hysteresis * (late - felt)
+            late = load + params.memory * (late - load)
+            value = value + params.hysteresis * (late - load)
         if params.crosstalk is not None:
             value = value + params.crosstalk / 4 * neighbour_difference(value, self.grid)
         if params.gain is not None:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.geometry import rotations, sdf
+from dexsim.geometry import rotations
 from dexsim.geometry.distance import signed_distance
 from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.touch.skin import Skin, skin_stress
@@ -30,33 +30,6 @@ class Touch:
     force: jax.Array  # [F, N] N, the finger's total from the physics, shared by `skin_force`
 
 
-def feel(
-    taxels: jax.Array,
-    area: jax.Array,
-    geometry: Any,
-    position: jax.Array,
-    rotation: jax.Array,
-    finger_force: jax.Array,
-    skin: Skin,
-    pad_thickness_delta: jax.Array | float = 0.0,
-) -> Touch:
-    """Taxel forces from the geometry of the contact and the finger's total force.
-
-    Args:
-      taxels: [F, N, 3] m, taxel positions in the palm frame.
-      area: [F, N] m^2.
-      geometry, position [3], rotation [3, 3]: the object, prepared for any method of
-        `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
-      finger_force: [F] N, resultant fingertip-object force of the physics.
-      skin: the skin's law.
-      pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
-
-    A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
-    that has no taxels.
-    """
-    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin, pad_thickness_delta)
-
-
 def feel_links(
     hand: Hand,
     pose: HandPose,
@@ -68,33 +41,31 @@ def feel_links(
     surface: Surface | None = None,
     pad_thickness_delta: jax.Array | float = 0.0,
 ) -> Touch:
-    """`feel` for all taxels of a posed hand, or for other points of its fingertips' skin.
+    """What the taxels of a posed hand feel, or other points of its fingertips' skin.
 
-    It transforms points directly from the links' frames to the object's: one transform a finger instead of two a
-    taxel, and no taxel positions in memory.
+    Args:
+      hand, pose: the hand and where its links are.
+      geometry, position [3], rotation [3, 3]: the object, prepared for any method of
+        `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
+      finger_force: [F] N, resultant fingertip-object force of the physics.
+      skin: the skin's law.
+      surface: other points than the taxels.
+      pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
+
+    A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
+    that has no taxels.
     """
     surface = surface or taxels_only(hand)
+    # From the links' frames directly to the object's: one transform a finger instead of two a taxel.
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
     shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position[None])
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
-    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin, pad_thickness_delta)
-
-
-def _press(
-    points: jax.Array,
-    area: jax.Array,
-    geometry: Any,
-    finger_force: jax.Array,
-    skin: Skin,
-    pad_thickness_delta: jax.Array | float = 0.0,
-) -> Touch:
-    """`feel` for points [F, N, 3] in the object's frame."""
     margin = jnp.maximum(skin.margin + pad_thickness_delta, 0.0)
-    depth = jnp.maximum(margin - signed_distance(points, geometry), 0.0)
-    skin_force = skin_stress(depth / skin.thickness, skin) * area
+    depth = jnp.maximum(margin - signed_distance(jnp.stack(local, -1), geometry), 0.0)
+    skin_force = skin_stress(depth / skin.thickness, skin) * jnp.asarray(surface.area)
     return Touch(depth, skin_force, spread(skin_force, finger_force))
 
 
@@ -104,27 +75,16 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
     return finger_force[:, None] * skin_force / jnp.where(total > 0, total, 1.0)
 
 
-def pressing_force(force: jax.Array, normals: jax.Array, finger_force: jax.Array) -> jax.Array:
-    """What of each finger's force presses into its skin, [F] N; 0 for a finger that touches nothing.
-
-    Args:
-      force: [F, N] N, normal forces on the taxels; they say where the contact is.
-      normals: [F, N, 3] outward taxel normals, in any frame.
-      finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
-    """
-    inward = -jnp.sum(force[..., None] * normals, -2)
-    square = jnp.sum(inward**2, -1, keepdims=True)
-    touching = square > 0
-    inward = inward / jnp.sqrt(jnp.where(touching, square, 1.0))
-    return jnp.sum(finger_force * inward, -1)
-
-
 def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
-    """The same touch with only the pressing part of the fingers' forces shared among the taxels.
+    """The same touch with only what presses into the skin of the fingers' forces shared among the taxels.
 
     Args:
+      touch: its normal forces say where the contact is; a finger that touches nothing keeps 0.
       normals: [F, N, 3] outward taxel normals, in any frame.
       finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
     """
-    pressed = pressing_force(touch.skin_force, normals, finger_force)
-    return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressed, 0.0)))
+    inward = -jnp.sum(touch.skin_force[..., None] * normals, -2)
+    square = jnp.sum(inward**2, -1, keepdims=True)
+    inward = inward / jnp.sqrt(jnp.where(square > 0, square, 1.0))  # the gradient of a norm is NaN at 0
+    pressing = jnp.sum(finger_force * inward, -1)
+    return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressing, 0.0)))

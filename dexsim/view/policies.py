@@ -24,7 +24,7 @@ class PolicyShelf:
     def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
         self._layout = tuple(env.observation_layout["actor"])
         self._runs = runs
-        self._kept: dict[str, tuple[float, Policy | None]] = {}
+        self._loaded: dict[str, tuple[float, Policy | None]] = {}
         self._first = first
         self._shipped = [path.stem for path in sorted(asset_path("policies/grasp.msgpack").parent.glob("*.msgpack"))]
 
@@ -43,16 +43,16 @@ class PolicyShelf:
         if name == NONE:
             return None
         time = 0.0 if name in self._shipped else _changed(Path(name))
-        kept = self._kept.get(name)
-        if kept is None or kept[0] != time:
-            try:
-                policy: Policy | None = load_policy(name)
-            except (CheckpointError, OSError):
-                policy = kept[1] if kept else None
-            if policy is not None and policy.observation_layout != self._layout:
-                policy = None
-            kept = self._kept[name] = time, policy
-        return kept[1]
+        if name not in self._loaded or self._loaded[name][0] != time:
+            self._loaded[name] = time, self._load(name)
+        return self._loaded[name][1]
+
+    def _load(self, name: str) -> Policy | None:
+        try:
+            policy = load_policy(name)
+        except (CheckpointError, OSError):
+            return self._loaded.get(name, (0.0, None))[1]
+        return policy if policy.observation_layout == self._layout else None
 
 
 def _changed(path: Path) -> float:

@@ -112,13 +112,8 @@ class Scene:
         """The object's primitives, and again for the goal, where they are not those of the frame before."""
         snapshot = frame.snapshot
         active = np.flatnonzero(snapshot.primitive_active)
-        shape = (
-            tuple(frame.kinds[k] for k in active),
-            *(
-                np.asarray(x)[active].tobytes()
-                for x in (snapshot.primitive_size, snapshot.primitive_position, snapshot.primitive_rotation)
-            ),
-        )
+        arrays = snapshot.primitive_size, snapshot.primitive_position, snapshot.primitive_rotation
+        shape = tuple(frame.kinds[k] for k in active), *(np.asarray(array)[active].tobytes() for array in arrays)
         if shape == self._shape:
             return
         self._shape = shape
@@ -149,9 +144,9 @@ class Scene:
 def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
     """Arrows [M, 2, 3] m of the fingers that feel something: from the centre of force, along what the taxels bear."""
     total = taxel_force.sum(-1)
-    felt = total > 0
-    force = -np.einsum("fn,fnk->fk", taxel_force, pose.taxel_normal)[felt]
-    centre = np.einsum("fn,fnk->fk", taxel_force, pose.taxel_position)[felt] / total[felt, None]
+    touching = total > 0
+    force = -np.einsum("fn,fnk->fk", taxel_force, pose.taxel_normal)[touching]
+    centre = np.einsum("fn,fnk->fk", taxel_force, pose.taxel_position)[touching] / total[touching, None]
     # The head is at the skin, so that the arrow is outside of the finger.
     return np.stack([centre - _METRES_PER_NEWTON * force, centre], 1)
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import errno
 import io
 import socket
 import time
@@ -31,7 +30,7 @@ class Viewer:
       host, port: where the page is served.
 
     Raises:
-      DexsimError: viser is not installed, `host` is no address of this computer, or no port is free.
+      DexsimError: viser is not installed, or `host` is no address of this computer.
     """
 
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
@@ -39,7 +38,10 @@ class Viewer:
         import viser
 
         self.source, hand = source, source.hand
-        port = free_port(host, port)
+        try:  # viser would wait forever
+            socket.create_server((host, 0)).close()
+        except OSError as error:
+            raise DexsimError(f"host {host!r:.100}: no page can be served there ({error.strerror or error})") from None
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.
             self.server = viser.ViserServer(host=host, port=port, label=title)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
@@ -118,10 +120,10 @@ class Viewer:
 
     def _show(self, frame: Frame) -> None:
         # On a hand nothing measures the true force: every source shows what the taxels feel.
-        felt = np.asarray(frame.snapshot.taxel_force).sum(-1)
-        snapshot = dataclasses.replace(frame.snapshot, finger_force=felt)
+        total = np.asarray(frame.snapshot.taxel_force).sum(-1)
+        snapshot = dataclasses.replace(frame.snapshot, finger_force=total)
         self._taxel_range = max(self._taxel_range, float(np.max(snapshot.taxel_force)))
-        self._finger_range = max(self._finger_range, float(np.max(felt)))
+        self._finger_range = max(self._finger_range, float(np.max(total)))
         self.scene.show(frame, self._taxel_range)
         if time.monotonic() < self._read_out_at + _READ_OUT:
             return
@@ -139,38 +141,3 @@ class Viewer:
             self._finger_range,
             FELT,
         )
-
-
-def free_port(host: str, port: int) -> int:
-    """The port, or the next free one.
-
-    Viser looks for one by itself, but waits forever where there is none.
-
-    Raises:
-      DexsimError: `host` is no address of this computer, or no port from this one on is free.
-    """
-    try:
-        _listen(host, 0)
-    except OSError as error:
-        raise DexsimError(f"host {host!r:.100}: no page can be served there ({error.strerror or error})") from None
-    for number in range(port, 65536):
-        with contextlib.suppress(OSError):
-            _listen(host, number)
-            return number
-    raise DexsimError(f"port {port}: neither it nor one after it is free")
-
-
-def _listen(host: str, port: int) -> None:
-    """Raises OSError: the port is taken, or a server can listen at none of the host's addresses."""
-    failed, addresses = (
-        list[OSError](),
-        socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE),
-    )
-    for family, _, _, _, address in addresses:
-        try:
-            socket.create_server(address[:2], family=family).close()
-        except OSError as error:
-            failed.append(error)
-    # A computer without IPv6 may still name its address.
-    if failed and (len(failed) == len(addresses) or any(error.errno == errno.EADDRINUSE for error in failed)):
-        raise failed[0]

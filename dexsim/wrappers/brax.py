@@ -113,19 +113,6 @@ class BraxEnv(Env):
         """One control tick, s."""
         return self.env.control_period
 
-    def snapshot(self, state: State) -> Any:
-        """What a picture of a state needs (`dexsim.render.snapshot.Snapshot`)."""
-        return evaluation_of(self.env).snapshot(self._to_dexsim(state))
-
-    def render(self, trajectory: Sequence[State], height: int = 480, width: int = 640) -> list[np.ndarray]:
-        """Pictures uint8 `[height, width, 3]` of brax states without a batch axis."""
-        from dexsim.render.render import render_frame
-
-        return [
-            render_frame(self.env.hand, self.env.primitive_kinds, self.snapshot(state), size=(width, height))
-            for state in trajectory
-        ]
-
     def _to_brax(self, state: Any, last: State | None = None) -> State:
         # brax's wrappers keep entries of their own in `metrics` and `info`: they stay.
         carried, info = (last.metrics, last.info) if last is not None else ({}, {})

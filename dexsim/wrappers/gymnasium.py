@@ -35,12 +35,10 @@ class GymVectorEnv(VectorEnv):
       observation_group: "actor" or "critic".
 
     Raises:
-      ConfigError: no environments, or no such group.
+      ConfigError: no such group.
     """
 
     def __init__(self, env: Env, num_envs: int, observation_group: str = "actor"):
-        if num_envs < 1:
-            raise ConfigError(f"num_envs = {num_envs}: must be at least 1")
         if observation_group not in env.observation_layout:
             groups = ", ".join(env.observation_layout)
             raise ConfigError(f"no observation group {observation_group!r}: choose from {groups}")
@@ -74,12 +72,10 @@ class GymVectorEnv(VectorEnv):
           `final_obs` [num_envs, n] and `final_info` (return and length) with the masks `_final_obs`, `_final_info`.
 
         Raises:
-          ConfigError: actions of another shape, or before the first reset.
+          ConfigError: before the first reset.
         """
         if self._state is None:
             raise ConfigError("reset the environment before its first step")
-        if np.shape(actions) != self.action_space.shape:
-            raise ConfigError(f"the actions have the shape {np.shape(actions)}, expected {self.action_space.shape}")
         self._state, last = self._advance(self._state, np.asarray(actions, np.float32))
         terminated, truncated = np.array(last.terminated), np.array(last.truncated)
         done, info = terminated | truncated, dict[str, Any]()

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from palm_touch import feel
 
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.objects.config import SHAPES
-from dexsim.touch.feel import feel
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.

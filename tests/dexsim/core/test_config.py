@@ -10,14 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim.core.config import check_ranges, from_dict, naming_file, override, setting, to_dict, validate
-from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.core.config import Config, check_ranges, from_dict, naming_file, override, setting, to_dict, validate
+from dexsim.core.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.randomization import Randomization
-from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
-from dexsim.touch.skin import Skin
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,60 +51,30 @@ def message(build, *arguments, **keywords):
     return text
 
 
-@pytest.mark.parametrize(
-    ("fields", "wanted"),
-    [
-        (dict(stiffness=9.0), "Spring.stiffness = 9 N/m: must be between 0.5 and 8 N/m"),
-        (dict(stiffness=0.25), "Spring.stiffness = 0.25 N/m: must be between 0.5 and 8 N/m"),
-        (dict(turns=0), "Spring.turns = 0: must be at least 1"),
-        (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
-        (dict(stiffness="2"), "Spring.stiffness = '2': expected float"),
-        (dict(stiffness=None), "Spring.stiffness = None: expected float"),
-        (dict(turns=3.0), "Spring.turns = 3.0: expected int"),
-        (dict(turns=True), "Spring.turns = True: expected int"),
-        (dict(span=1.0), "Spring.span = 1.0: expected a list"),
-        (dict(span=(1.0,)), "Spring.span: expected 2 values, got 1"),
-        (dict(wound="no"), "Spring.wound = 'no': expected bool"),
-        (dict(span=(0.0, 3.0)), "Spring.span = 3 m: must be between -1 and 2 m"),
-        (dict(span=(1.0, 0.5)), "Spring.span = (1, 0.5): the first must not exceed the second"),
-        (dict(wire="tin"), "Spring.wire = 'tin': choose from steel, brass"),
-        (dict(marks=("red", "green")), "Spring.marks = 'green': choose from red, blue"),
-        (dict(stiffness=math.nan), "Spring.stiffness = nan: must be a finite number"),
-        (dict(rest=-math.inf), "Spring.rest = -inf: must be a finite number"),
-        (dict(span=(0.0, math.nan)), "Spring.span = nan: must be a finite number"),
-    ],
-)
-def test_a_refusal_says_what_where_and_which_range(fields, wanted):
-    assert message(Spring, **fields) == wanted
+REFUSED = [
+    (dict(stiffness=9.0), "Spring.stiffness = 9 N/m: must be between 0.5 and 8 N/m"),
+    (dict(turns=0), "Spring.turns = 0: must be at least 1"),
+    (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
+    (dict(stiffness="2"), "Spring.stiffness = '2': expected float"),
+    (dict(stiffness=None), "Spring.stiffness = None: expected float"),
+    (dict(turns=3.0), "Spring.turns = 3.0: expected int"),
+    (dict(turns=True), "Spring.turns = True: expected int"),
+    (dict(span=1.0), "Spring.span = 1.0: expected a list"),
+    (dict(span=(1.0,)), "Spring.span: expected 2 values, got 1"),
+    (dict(span=(0.0, 3.0)), "Spring.span = 3 m: must be between -1 and 2 m"),
+    (dict(span=(1.0, 0.5)), "Spring.span = (1, 0.5): the first must not exceed the second"),
+    (dict(wire="tin"), "Spring.wire = 'tin': choose from steel, brass"),
+    (dict(marks=("red", "green")), "Spring.marks = 'green': choose from red, blue"),
+    (dict(name=4), "Spring.name = 4: expected str"),
+    (dict(wound="no"), "Spring.wound = 'no': expected bool"),
+    (dict(stiffness=math.nan), "Spring.stiffness = nan: must be a finite number"),
+]
 
 
-def test_the_ends_of_a_range_belong_to_it():
-    for stiffness in (0.5, 8.0):
-        assert Spring(stiffness=stiffness).stiffness == stiffness
-    assert Spring(span=(1.0, 1.0), marks=("red", "blue", "red")).span == (1.0, 1.0)
-
-
-def test_config_errors_are_the_librarys():
-    assert issubclass(ConfigError, DexsimError)
-
-
-@pytest.mark.parametrize(
-    ("build", "fields", "words"),
-    [
-        (Skin, dict(thickness=0.0), ("Skin.thickness", "0 m", "0.0001 and 0.02 m")),
-        (TaxelSensor, dict(saturation=0.0), ("TaxelSensor.saturation", "0 N", "0.1 and 1000 N")),
-        (PhysicsConfig, dict(timestep=0.5), ("PhysicsConfig.timestep", "0.5 s", "0.0001 and 0.02 s")),
-        (PhysicsConfig, dict(contacts="fist"), ("PhysicsConfig.contacts", "'fist'", "closed, mjx")),
-        (ObjectConfig, dict(mass=(0.3, 0.1)), ("ObjectConfig.mass", "0.3, 0.1")),
-        (Randomization, dict(latency=(0.0, 1.0)), ("Randomization.latency", "1 s", "0 and 0.2 s")),
-        (GraspReward, dict(drop=3.0), ("GraspReward.drop", "3", "-10000 and 0")),
-        (GraspConfig, dict(finger_force=(5.0, 2.0)), ("GraspConfig.finger_force", "5, 2")),
-        (GraspConfig, dict(pool_size=0), ("GraspConfig.pool_size", "0", "1 and 1000000")),
-    ],
-)
-def test_the_librarys_own_configs_refuse_alike(build, fields, words):
-    text = message(build, **fields)
-    assert all(word in text for word in words), text
+@pytest.mark.parametrize(("fields", "expected"), REFUSED)
+def test_a_wrong_value_is_named_with_its_range_in_code_and_in_a_file(fields, expected):
+    assert message(Spring, **fields) == expected
+    assert message(from_dict, Chair, {"seat": fields}) == expected
 
 
 def nested_configs(cls):
@@ -158,11 +126,6 @@ def test_the_round_trip_of_the_grasp_config():
         assert hash(again) == hash(config)  # usable as a static argument
 
 
-def test_fields_left_out_keep_their_default():
-    config = from_dict(GraspConfig, {"reward": {"sigma": 0.3}})
-    assert config == dataclasses.replace(GraspConfig(), reward=GraspReward(sigma=0.3))
-
-
 @given(
     st.floats(0.5, 8.0),
     st.integers(1, 99),
@@ -183,31 +146,16 @@ def test_any_config_survives_the_round_trip(stiffness, turns, low, high, wire, m
 
 
 @pytest.mark.parametrize(
-    ("data", "wanted"),
+    ("data", "expected"),
     [
         ({"backs": 1}, "Chair has no field 'backs'"),
         ({"seat": {"colour": "red"}}, "Spring has no field 'colour'"),
-        ({"legs": "four"}, "Chair.legs = 'four': expected int"),
-        ({"legs": 4.5}, "Chair.legs = 4.5: expected int"),
-        ({"legs": True}, "Chair.legs = True: expected int"),
-        ({"legs": None}, "Chair.legs = None: expected int"),
         ({"seat": 3}, "Spring: expected a table of fields, got int"),
-        ({"seat": {"stiffness": "hard"}}, "Spring.stiffness = 'hard': expected float"),
-        ({"seat": {"stiffness": False}}, "Spring.stiffness = False: expected float"),
-        ({"seat": {"stiffness": 99.0}}, "Spring.stiffness = 99 N/m: must be between 0.5 and 8 N/m"),
-        ({"seat": {"wire": 3}}, "Spring.wire = 3: expected str"),
-        ({"seat": {"wound": 1}}, "Spring.wound = 1: expected bool"),
-        ({"seat": {"span": [1.0]}}, "Spring.span: expected 2 values, got 1"),
-        ({"seat": {"span": 1.0}}, "Spring.span = 1.0: expected a list"),
-        ({"seat": {"span": [0.0, "far"]}}, "Spring.span = 'far': expected float"),
-        ({"seat": {"marks": "red"}}, "Spring.marks = 'red': expected a list"),
-        ({"seat": {"marks": [1]}}, "Spring.marks = 1: expected str"),
-        ({"seat": {"name": 4}}, "Spring.name = 4: expected str"),
         ([], "Chair: expected a table of fields, got list"),
     ],
 )
-def test_a_bad_dictionary_is_refused_by_name(data, wanted):
-    assert message(from_dict, Chair, data) == wanted
+def test_a_dictionary_of_other_fields_is_an_error(data, expected):
+    assert message(from_dict, Chair, data) == expected
 
 
 def test_errors_of_a_file_begin_with_its_name():
@@ -228,16 +176,6 @@ def test_literal_types_are_choices():
     assert Door(side="left", marks=(1, 2)) and Door(side=None)
     assert message(Door, side="top") == "Door.side = 'top': choose from left, right"
     assert message(Door, marks=(3,)) == "Door.marks = 3: choose from 1, 2"
-
-
-def test_a_whole_number_serves_as_a_real_one():
-    spring = from_dict(Spring, {"stiffness": 4, "span": [0, 1]})
-    assert spring == Spring(stiffness=4.0) and type(spring.stiffness) is float
-
-
-def test_units_and_ranges_are_there_for_the_command_line_and_the_documents():
-    field = next(f for f in dataclasses.fields(Spring) if f.name == "stiffness")
-    assert dict(field.metadata) == {"unit": "N/m", "low": 0.5, "high": 8.0, "choices": None}
 
 
 def test_override_replaces_fields_by_their_path():
@@ -269,34 +207,25 @@ def test_override_replaces_fields_by_their_path():
     assert from_dict(GraspConfig, override({}, ["objects.extremes=1"])).objects.extremes == 1.0
     for entry, said in (
         ("objects.extreme=1", "ObjectConfig has no field 'extreme'"),
-        ("objects.extremes=7", "between 0 and 1"),
         ("objects.extremes=much", "expected float"),
-        ("objects=1", "expected a table"),
-        ("episode_seconds.x=1", "expected float"),
-        ("extremes", "expected NAME=VALUE"),
-        ("=1", "expected NAME=VALUE"),
         ("extremes=", "expected NAME=VALUE"),
     ):
         with pytest.raises(ConfigError, match=said):
             from_dict(GraspConfig, override(plain, [entry]))
 
 
-def test_a_type_that_only_a_type_checker_knows_does_not_hinder_the_check():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Lamp:
-        colour: str = setting("red", choices=("red", "blue"))
-        bulb: "Nowhere" = None  # noqa: F821
-
-        def __post_init__(self):
-            validate(self)
-
-    assert message(Lamp, colour="green") == "Lamp.colour = 'green': choose from red, blue"
-
-
-def test_a_configuration_is_no_table_and_numbers_of_numpy_become_pythons():
+def test_numbers_of_numpy_become_pythons():
     """As a file gives them back, so that they are saved, hashed and compared like those that were read."""
-    assert message(Chair, seat={"turns": 3}) == "Chair.seat = {'turns': 3}: expected a Spring"
     spring = Spring(turns=np.int64(4), stiffness=np.float32(2.5), span=[np.float32(0.5), 1], wound=np.bool_(False))
     assert spring == from_dict(Spring, json.loads(json.dumps(to_dict(spring))))
     assert type(spring.turns) is int and type(spring.stiffness) is float and spring.span == (0.5, 1)
     assert Spring(span=np.array([0.25, 0.5])).span == (0.25, 0.5) and hash(spring)
+
+
+def test_a_field_without_a_default_must_be_given():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Nail(Config):
+        length: float = setting(unit="m", low=0.0, high=1.0)
+
+    assert from_dict(Nail, {"length": 1}).length == 1.0
+    assert message(from_dict, Nail, {}) == "Nail.length is missing"

@@ -1,60 +1,18 @@
-"""Files: what a killed program leaves is removed, and folders that others may write to are turned away."""
+"""Files: whole or not at all; folders that others may write to are turned away."""
 
 import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
-from paths import ROOT
 
 from dexsim.core import cli
+from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import ConfigError, DexsimWarning
 from dexsim.core.files import make_private, read_toml, write_whole
 
 # Writes half of a file, says so, and waits to be killed.
-HALF = """
-import sys, time
-from pathlib import Path
-from dexsim.core.files import write_whole
-
-def chunks():
-    yield b"x" * 2**20
-    print("half", flush=True)
-    time.sleep(60)
-    yield b"never"
-
-write_whole(Path(sys.argv[1]), chunks())
-"""
-
-
-def begin(path):
-    """A process in the middle of a write."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HALF, str(path)],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert process.stdout.readline() == "half\n"
-    return process
-
-
-def test_what_a_kill_during_a_write_leaves_is_removed_by_the_next_write(tmp_path):
-    killed, writing = begin(tmp_path / "00000100.msgpack"), begin(tmp_path / "00000200.msgpack")
-    try:
-        killed.send_signal(signal.SIGKILL)
-        killed.wait()
-        assert len(list(tmp_path.iterdir())) == 2
-        write_whole(tmp_path / "00000300.msgpack", [b"whole"])
-        left = {path.name for path in tmp_path.iterdir()}
-        assert "00000300.msgpack" in left and len(left) == 2
-        assert any(name.startswith(".00000200.msgpack") for name in left), "that one is still being written"
-    finally:
-        writing.kill()
-        writing.wait()
 
 
 def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
@@ -95,14 +53,31 @@ def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):
     assert read_toml(tmp_path / "hand.toml") == {"name": "from a spreadsheet"}
 
 
-def test_only_temporaries_are_removed(tmp_path):
-    mine = {".hidden", "a.part", ".b.txt", ".download.part", ".file.12345678.part"}
-    for name in mine:
-        (tmp_path / name).write_text("mine")
-    write_whole(tmp_path / "file", [b"1"])
-    write_whole(tmp_path / "file", [b"2"])
-    assert {path.name for path in tmp_path.iterdir()} == mine | {"file"}
-    assert (tmp_path / "file").read_bytes() == b"2"
+def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
+    def chunks():
+        yield b"x" * 2**20
+        raise KeyboardInterrupt
+
+    (tmp_path / "file").write_text("before")
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "file", chunks())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
+
+
+def test_cached_arrays_are_made_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    made = []
+
+    def make():
+        made.append(1)
+        return {"x": np.arange(3)}
+
+    for key in ("a", "a", "b"):
+        np.testing.assert_array_equal(cached_arrays("numbers", key, make)["x"], [0, 1, 2])
+    assert len(made) == 2
+    for path in (tmp_path / "numbers").iterdir():
+        path.write_bytes(b"damaged")
+    assert cached_arrays("numbers", "a", make)["x"][2] == 2 and len(made) == 3
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o444])

@@ -28,7 +28,7 @@ def test_a_bar_on_a_terminal_counts_and_goes(screen):
     terminal.append(True)
     with progress.progress("grasp", 128, "episodes") as show:
         show(64)
-    assert "grasp" in out.getvalue() and max(map(len, out.getvalue().split("\r"))) < 400
+    assert "grasp" in out.getvalue()
     assert out.getvalue().rstrip().endswith("\x1b[2K"), "the bar is removed at the end"
 
 

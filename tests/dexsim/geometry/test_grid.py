@@ -55,7 +55,6 @@ def test_distance_to_a_box_mesh_is_the_closed_form():
     )
     smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-4
     np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
-    assert box.volume == pytest.approx(8 * BOX.prod())
 
 
 def test_nearest_triangle_is_the_nearest_of_all():
@@ -89,44 +88,36 @@ def flat(part):
     return part
 
 
-def test_bad_meshes_are_refused_in_one_line():
+def bad_meshes():
     box = trimesh.creation.box(2 * BOX)
     vertices, faces = np.array(box.vertices), np.array(box.faces)
-    nan = vertices.copy()
+    nan, mixed = vertices.copy(), faces.copy()
     nan[3, 1] = np.nan
-    mixed = faces.copy()
     mixed[4] = mixed[4][::-1]
+    return {
+        "open": (vertices, faces[:-1]),
+        "inward": turned(box.copy()),
+        "both ways": (vertices, mixed),
+        "no volume": flat(box.copy()),
+        "not finite": (nan, faces),
+        "scale=0.001": (1000 * vertices, faces),
+        "6e-05 m across": (1e-3 * vertices, faces),
+        "no triangles": (vertices, faces[:0]),
+        "nowhere.stl": "nowhere.stl",
+    }
+
+
+@pytest.mark.parametrize("word", bad_meshes())
+def test_a_bad_mesh_is_an_error(word):
+    with pytest.raises(AssetError, match=word):
+        mesh.load_mesh(bad_meshes()[word])
+
+
+def test_a_mesh_that_cuts_through_itself_cannot_be_signed():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    cases = [
-        ((vertices, faces[:-1]), "open, 3 edges belong to one triangle only"),
-        (turned(box.copy()), "normals point inward"),
-        ((vertices, mixed), "normals point both ways"),
-        (flat(box.copy()), "encloses no volume"),
-        ((nan, faces), "vertex 3 is not finite"),
-        ((1000 * vertices, faces), "60 m across.*scale=0.001"),
-        ((1e-3 * vertices, faces), "6e-05 m across"),
-        ((vertices, faces[:0]), "no triangles"),
-        ((vertices, faces + 4), "names vertex 11"),
-        ((vertices[:, :2], faces), r"\[V, 3\]"),
-        ("nowhere.stl", "no such file"),
-        (3, "no triangle mesh"),
-        ((vertices,), "a tuple of 1; give .vertices, faces."),
-        ((vertices, faces + 0.7), "must be whole numbers"),
-        ((vertices, [[0, 1, 2], [3]]), "must be arrays of numbers"),
-        ((np.full(vertices.shape, "a"), faces), "must be arrays of numbers"),
-    ]
     overlapping = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.02, 0, 0))])
-    for source, words in cases:
-        with pytest.raises(AssetError, match=words) as caught:
-            mesh.load_mesh(source)
-        assert "\n" not in str(caught.value)
-    for bad in (
-        overlapping,
-        trimesh.util.concatenate([ball, turned(ball.copy().apply_translation((0.09, 0, 0))).apply_scale(0.5)]),
-    ):
-        with pytest.raises(AssetError, match="cannot be signed: inside and outside disagree at") as caught:
-            mesh.check_sign(mesh.load_mesh(bad))
-        assert "\n" not in str(caught.value)
+    with pytest.raises(AssetError, match="cannot be signed"):
+        mesh.check_sign(mesh.load_mesh(overlapping))
 
 
 def test_files_are_read_in_their_unit(tmp_path):
@@ -170,31 +161,6 @@ def test_edges_cost_no_more_than_a_cell():
     points, value, _ = shell(shape)
     error = np.abs(np.asarray(signed_distance(points, grid.bake(shape))) - value)
     assert error.mean() <= 10e-6 and np.quantile(error, 0.95) < 50e-6 and error.max() < 0.5e-3
-
-
-def test_the_analytic_gradient_is_the_automatic_one():
-    baked = grid.bake(solid("ellipsoid", *SMOOTH["ellipsoid"]), nodes=COARSE)
-    points = np.random.default_rng(5).uniform(-0.05, 0.05, (400, 3)).astype(np.float32)  # inside and beyond
-
-    def both(p):
-        value, gradient = grid._look_up(p, baked)
-        return value, jnp.stack(gradient, -1)
-
-    _, analytic = jax.jit(both)(points)
-    automatic = jax.jit(jax.grad(lambda p: grid.signed_distance(p, baked).sum()))(points)
-    np.testing.assert_allclose(analytic, automatic, atol=2e-5)
-
-
-def test_sizes_share_one_array():
-    """Under vmap each environment reads the grid at its own size, as if alone; the values are not copied."""
-    baked = grid.bake(solid("capsule", 0.015, 0.02), nodes=COARSE)
-    points = np.random.default_rng(6).uniform(-0.05, 0.05, (200, 3)).astype(np.float32)
-    scale = jnp.array([1.0, 1.2, 0.8, 1.1])
-    run = jax.jit(jax.vmap(lambda scale: grid.signed_distance(points, grid.scaled(baked, scale))))
-    for row, s in zip(np.asarray(run(scale)), scale, strict=True):
-        np.testing.assert_allclose(row, s * signed_distance(points / np.float32(s), baked), atol=1e-7)
-    # No intermediate is as large as a copy of the values per environment.
-    assert run.lower(scale).compile().memory_analysis().temp_size_in_bytes < 4 * baked.values.size
 
 
 def trilinear(points, distance, origin, step):
@@ -255,7 +221,7 @@ def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
     points = np.random.default_rng(7).uniform(-0.03, 0.03, (500, 3)).astype(np.float32)
     baked = grid.bake(solid("box", *BOX), nodes=COARSE)
     np.testing.assert_allclose(signed_distance(points, first), signed_distance(points, baked), atol=1e-6)
-    (kept,) = grid.cache_folder().glob("*.npz")
+    (kept,) = (tmp_path / "cache" / "sdf").glob("*.npz")
 
     def refuse(*_):
         raise AssertionError("baked again")

@@ -1,7 +1,6 @@
 """Rotations against C MuJoCo, NumPy and hand-made cases."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -60,28 +59,6 @@ def test_quaternion_product_and_inverse_are_mujocos():
     np.testing.assert_allclose(unit, np.tile([1, 0, 0, 0], (64, 1)), atol=1e-6)
 
 
-def test_products_broadcast_like_matmul():
-    matrix, vector = RNG.normal(size=(5, 1, 3, 3)), RNG.normal(size=(4, 3))
-    np.testing.assert_allclose(
-        rotations.rotate(f32(matrix), f32(vector)), np.einsum("aoij,bj->abi", matrix, vector), rtol=1e-5, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        rotations.rotate_inverse(f32(matrix), f32(vector)),
-        np.einsum("aoij,bi->abj", matrix, vector),
-        rtol=1e-5,
-        atol=1e-6,
-    )
-    other = RNG.normal(size=(4, 3, 3))
-    np.testing.assert_allclose(rotations.compose(f32(matrix), f32(other)), matrix @ other, rtol=1e-5, atol=1e-6)
-
-
-def test_a_quarter_turn_by_hand():
-    quarter = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), jnp.pi / 2)
-    np.testing.assert_allclose(quarter, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
-    turned = rotations.rotate(rotations.quat_to_matrix(quarter), jnp.array([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-6)
-
-
 @given(st.floats(1e-5, np.pi - 1e-3), st.integers(0, 63), st.integers(0, 63))
 def test_angle_between_orientations(angle, at, about):
     # Unit quaternions in float32 are good for about 1e-7, so an angle of 1e-5 for a few percent.
@@ -96,10 +73,3 @@ def test_angle_has_a_finite_gradient_at_zero():
     quat = f32(QUATS[0])
     assert float(rotations.quat_angle(quat, quat)) < 1e-6
     assert np.all(np.isfinite(jax.grad(rotations.quat_angle)(quat, quat)))
-
-
-def test_six_d_is_two_columns():
-    matrix = np.array([mujoco_matrix(q) for q in QUATS])
-    sixd = rotations.matrix_to_6d(f32(matrix))
-    np.testing.assert_allclose(sixd[:, :3], matrix[:, :, 0], atol=1e-6)
-    np.testing.assert_allclose(sixd[:, 3:], matrix[:, :, 1], atol=1e-6)

@@ -168,18 +168,10 @@ def test_driven_hinges_keep_their_ratio(coupled):
     np.testing.assert_allclose(angles, hinge_angles(coupled, np.array([0.8, 1.0], np.float32)), atol=0.01)
 
 
-@pytest.mark.slow
-def test_mjx_moves_them_alike(coupled):
-    ours, worst = driven(coupled, "mjx")
-    assert worst < 0.02
-    np.testing.assert_allclose(ours, driven(coupled, "c")[0], atol=2e-3)
-
-
 COUPLE_A = '<joint name="couple_a" joint1="a_next" joint2="a" polycoef="0.05 1.3 0 0 0"/>'
 COUPLE_B = '<joint name="couple_b" joint1="b_next" joint2="b" polycoef="-0.1 0.7 0 0 0"/>'
 REFUSED = {
     "not linear": (COUPLE_A, COUPLE_A.replace("1.3 0 ", "1.3 0.2 "), "couple_a.*polycoef"),
-    "not a number": (COUPLE_A, COUPLE_A.replace("0.05", "nan"), "couple_a.*not a finite number"),
     "no ratio": (COUPLE_A, COUPLE_A.replace("1.3", "0"), "couple_a.*polycoef"),
     "one joint": (COUPLE_A, COUPLE_A.replace('joint2="a" ', ""), "couple_a.*two joints"),
     "switched off": (COUPLE_A, COUPLE_A.replace("/>", ' active="false"/>'), "couple_a.*active"),

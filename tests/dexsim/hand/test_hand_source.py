@@ -40,14 +40,6 @@ def test_unknown_name_is_one_line():
         load_hand("nohand")
 
 
-def test_a_folder_does_not_hide_a_shipped_hand(own, tmp_path):
-    for name in ("xhand_right", "leap_like"):
-        (tmp_path / name).mkdir()
-    assert load_hand().source == "xhand_right" and load_hand("leap_like").source == "leap_like"
-    with pytest.raises(AssetError, match="hand 'own': a folder, and no shipped hand has that name"):
-        load_hand("own")
-
-
 @pytest.mark.parametrize("quote", ['"', "'"])
 def test_the_hash_has_what_the_included_files_include(own, quote):
     """MuJoCo finds those beside the model, or beside the file that includes them."""

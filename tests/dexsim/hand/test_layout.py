@@ -1,6 +1,5 @@
 """Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
 
-import dataclasses
 import shutil
 
 import jax.numpy as jnp
@@ -88,9 +87,9 @@ def test_a_patch_of_a_mesh():
     assert np.cross(across, [0, 0, 1]) @ [1, 0, 0] > 0
     cosine = np.sqrt(1 - (points.u**2 + points.v**2) / 0.02**2)
     np.testing.assert_allclose(patch.area, 0.002**2 / cosine, rtol=0.03)
-    with pytest.raises(AssetError, match=r"column 0, row 0 misses the mesh"):
+    with pytest.raises(AssetError, match="misses the mesh or grazes it"):
         layout.on_mesh(ball, layout.lattice(9, 7, pitch=0.01), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
-    with pytest.raises(AssetError, match="too steep"):
+    with pytest.raises(AssetError, match="misses the mesh or grazes it"):
         layout.on_mesh(ball, layout.lattice(2, 2, pitch=0.0279), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
 
 
@@ -105,16 +104,13 @@ def test_the_hand_reads_what_was_written(tmp_path):
     patch = layout.on_surface("capsule", points, radius=0.009, half_length=0.006)
     patch = layout.placed(patch, position=(0, 0, 0.025), rotation=turn)
     patches = dict.fromkeys(("thumb", "index", "middle", "ring", "pinky"), patch)
-    path = layout.write_layout(tmp_path / "taxels.csv", patches)
+    layout.write_layout(tmp_path / "taxels.csv", patches)
     hand = load_hand(toml)
     assert hand.taxel_position.shape == (5, 48, 3) and hand.taxel_grid == (6, 8)
     for finger in range(5):
         np.testing.assert_allclose(hand.taxel_position[finger], patch.position, atol=6e-7)
         np.testing.assert_allclose(hand.taxel_normal[finger], patch.normal, atol=2e-6)
         np.testing.assert_allclose(hand.taxel_area[finger], patch.area, rtol=1e-5)
-    again = layout.read_layout(path)
-    assert list(again) == list(patches) and again["ring"].grid == (6, 8)
-    np.testing.assert_allclose(again["ring"].position, patch.position, atol=6e-7)
 
 
 def test_taxels_inside_the_link_are_refused(hand):
@@ -131,14 +127,11 @@ def test_taxels_inside_the_link_are_refused(hand):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: layout.lattice(0, 3, pitch=0.002), "0 x 3"),
-        (lambda: layout.lattice(2, 3, pitch=-1.0), "above 0"),
         (lambda: layout.lattice(2, 2, pitch=0.002, kind="round"), "rect or hex"),
         (
             lambda: layout.on_surface("cone", layout.lattice(2, 2, pitch=0.002), radius=0.01),
             "'cone': choose from plane",
         ),
-        (lambda: layout.on_surface("sphere", layout.lattice(2, 2, pitch=0.002)), "radius"),
         (lambda: layout.on_surface("cylinder", layout.lattice(20, 2, pitch=0.002), radius=0.005), "laps itself"),
         (lambda: layout.on_surface("sphere", layout.lattice(2, 20, pitch=0.002), radius=0.01), "beyond the pole"),
     ],
@@ -147,40 +140,3 @@ def test_refusals(make, words):
     with pytest.raises(ConfigError, match=words) as caught:
         make()
     assert "\n" not in str(caught.value)
-
-
-def test_broken_layout_files(tmp_path):
-    path = tmp_path / "taxels.csv"
-    with pytest.raises(AssetError, match="no such file"):
-        layout.read_layout(path)
-    path.write_text("finger,column\nthumb,0\n")
-    with pytest.raises(AssetError, match="not a taxel layout"):
-        layout.read_layout(path)
-    path.write_text(f"{','.join(layout.COLUMNS)}\nthumb,1000000,100000,0,0,0,1,0,0,1e-6\n")
-    with pytest.raises(AssetError, match="not a taxel layout .1000001 x 100001 taxels"):
-        layout.read_layout(path)
-    path.write_text(f"{','.join(layout.COLUMNS)}\n" + 200_000 * "a")
-    with pytest.raises(AssetError, match="not a taxel layout .field larger"):
-        layout.read_layout(path)
-    path.write_text(f"{','.join(layout.COLUMNS)}\n")
-    with pytest.raises(AssetError, match="not a taxel layout .no taxels"):
-        layout.read_layout(path)
-    with pytest.raises(ConfigError, match="one grid"):
-        layout.write_layout(
-            path,
-            {
-                "a": layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01)),
-                "b": layout.on_surface("plane", layout.lattice(2, 3, pitch=0.01)),
-            },
-        )
-
-
-@pytest.mark.parametrize("field", ["normal", "area", "position"])
-def test_an_unsound_patch_leaves_the_file_as_it_was(tmp_path, field):
-    good = layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01))
-    path = layout.write_layout(tmp_path / "taxels.csv", {"a": good})
-    before = path.read_bytes()
-    wrong = dataclasses.replace(good, **{field: np.full_like(getattr(good, field), np.nan)})
-    with pytest.raises(ConfigError, match="layout 'b'"):
-        layout.write_layout(path, {"a": good, "b": wrong})
-    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

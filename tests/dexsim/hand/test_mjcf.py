@@ -6,21 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.core.errors import AssetError
 from dexsim.hand.files import find_hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
-from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_scene
-from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import _place
-from dexsim_real.twin.plant.scene import build_scene as emulated_scene
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
-PAD = '<geom name="index_pad" class="pad" type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"/>'
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
 
 
@@ -79,29 +74,6 @@ def test_links_are_in_the_palm_frame_however_the_file_places_the_palm(tmp_path, 
     np.testing.assert_allclose(np.append(palm.xpos, palm.xquat), [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
 
 
-def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
-    plain = mujoco.MjModel.from_xml_path(
-        str(
-            load_hand(
-                rewrite(
-                    tmp_path,
-                    (PALM, f'<body name="wrist" {SKEW}>{PALM[:-1]} pos="0 0 0.1">'),
-                    (END, "</body></worldbody>"),
-                )
-            ).model_path
-        )
-    )
-    model = read_mjcf(load_hand(tmp_path / find_hand(None).name)).compile()
-    apart = []
-    for each in (plain, model):
-        data = mujoco.MjData(each)
-        mujoco.mj_kinematics(each, data)
-        wrist, palm = data.body("wrist"), data.body("right_hand_link")
-        apart.append((wrist.xpos - palm.xpos) @ palm.xmat.reshape(3, 3))
-    np.testing.assert_allclose(apart[1], apart[0], atol=1e-9)
-    assert np.linalg.norm(apart[0]) > 0.05
-
-
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 @pytest.mark.parametrize("setting", ["", 'inertiafromgeom="true"', 'settotalmass="1"'])
 def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch, setting):
@@ -113,19 +85,6 @@ def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch
         for field in ("mass", "inertia", "ipos", "iquat"):
             wanted, found = (getattr(model.body(name), field) for model in (alone, placed))
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15, err_msg=f"{name} {field}")
-
-
-@pytest.mark.parametrize(
-    ("shape", "words"),
-    [('type="capsule" mesh="tip"', "a mesh"), ('type="box" fromto="0 0 .018 0 0 .034" size=".008"', "fromto")],
-)
-def test_a_fingertip_whose_size_is_not_in_the_file_is_refused(tmp_path, shape, words):
-    """The compiler would fit it to the mesh without the rubber, and the spheres in it would be of rubber alone."""
-    tip = '<asset><mesh name="tip" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .03"/></asset><worldbody>'
-    pad = PAD.replace('type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"', shape)
-    hand = load_hand(rewrite(tmp_path, (PAD, pad), ("<worldbody>", tip)))
-    with pytest.raises(AssetError, match=f"xhand_right.xml: geom 'index_pad' of a fingertip has its size from {words}"):
-        scene(hand)
 
 
 def test_how_the_file_would_be_worked_out_is_not_for_the_scene(tmp_path):
@@ -148,24 +107,3 @@ def test_defaults_of_the_file_are_not_for_the_objects_contacts(tmp_path):
     assert not model.pair_solreffriction[of_object].any()
     assert model.geom("object_0").quat.tolist() == [1, 0, 0, 0]
     assert np.delete(model.pair_margin, of_object).tolist() == [0.01] * (model.npair - len(of_object))
-
-
-def test_options_of_the_file_do_not_reach_the_emulated_hands_scene(tmp_path):
-    flags = '<option tolerance="1"><flag gravity="disable" contact="disable" sleep="enable"/></option><worldbody>'
-    hand = load_hand(rewrite(tmp_path, ("<worldbody>", flags)))
-    parameters = sample_trial("grasp", np.random.default_rng(0), "nominal")
-    off = mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model = emulated_scene(hand, parameters, None, np.array([9.81, 0.0, 0.0])).model
-    assert not model.opt.disableflags & off and not model.opt.enableflags and model.opt.tolerance < 1e-6
-
-
-def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
-    numeric = '<custom><numeric name="max_contact_points" data="1"/></custom>\n  <worldbody>'
-    hand = load_hand(rewrite(tmp_path, ("thumb_pad_right", "thumb_pad_left_1"), ("<worldbody>", numeric)))
-    assert scene(hand).numeric("max_contact_points").data[0] == 20
-
-
-def test_a_link_without_a_name_is_refused(tmp_path):
-    path = rewrite(tmp_path, (PALM, PALM + "<body><geom size='0.01' contype='0' conaffinity='0'/></body>"))
-    with pytest.raises(AssetError, match="xhand_right.xml: a body of 'right_hand_link' has no name"):
-        load_hand(path)

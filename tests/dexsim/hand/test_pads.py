@@ -33,21 +33,12 @@ def test_taxels_are_on_the_pads_and_face_as_told():
 
 
 REFUSED = {
-    "no pitch": ("taxel_pitch = [0.0035, 0.0035]\n", "", "taxel_pitch = None"),
+    "no pitch": ("taxel_pitch = [0.0035, 0.0035]\n", "", "either taxels"),
     "pitch below 0": ("[0.0035, 0.0035]", "[0.0035, -1]", "taxel_pitch"),
-    "pitch too large for a float": ("[0.0035, 0.0035]", f"[0.0035, {'9' * 400}]", "taxel_pitch"),
-    "direction too large for a float": ("facing = [0, 0, 1]", f"facing = [0, 0, {'9' * 400}]", "facing"),
     "no such pad": ('pad = "index_pad"', 'pad = "palm"', "finger 'index': pad = 'palm'"),
-    "no direction": ("facing = [0, 0, 1]", "facing = 3", "finger 'thumb': facing = 3"),
-    "along the pad": ("facing = [0, 0, 1]", "facing = [0, 1, 0]", "runs along the pad 'thumb_pad'"),
+    "along the pad": ("facing = [0, 0, 1]", "facing = [0, 1, 0]", "across the pad 'thumb_pad'"),
     "laps itself": ("[6, 8]", "[60, 8]", "laps itself"),
-    "posture too short": ("posture = [1.2, ", "posture = [", "grasp.posture .*expected 16 numbers"),
-    "centre": ("centre = [", "centre = ['a', ", "grasp.centre"),
-    "root of another finger": (
-        'root_joint = "ring_mcp"',
-        'root_joint = "index_mcp"',
-        "'index_mcp' does not move .*ring_tip",
-    ),
+    "centre": ("centre = [", "centre = ['a', ", "GraspEntry.centre"),
 }
 
 

@@ -1,26 +1,21 @@
 """Skin beyond the taxels: its surface against closed forms, and the share that no taxel reads."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import ground_truth, tip_stiffness
+from episodes import tip_stiffness
 from scipy.spatial.transform import Rotation
 
-import dexsim
-from dexsim.core.config import override, to_dict
 from dexsim.geometry import sdf
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.physics import Physics
-from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.touch.feel import feel_links
 from dexsim.touch.skin import Skin, skin_stress
-from dexsim.touch.surface import taxels_only, whole_surface
+from dexsim.touch.surface import whole_surface
 
 REACH = 0.003
 SKIN = Skin()
@@ -44,26 +39,6 @@ def facing(hand, finger):
     front = front - axis * (front @ axis)
     front /= np.linalg.norm(front)
     return front, np.cross(axis, front)
-
-
-def test_area_of_a_capsule(hand):
-    everything = whole_surface(hand, -1.0)  # no taxel covers anything
-    for finger in range(1, hand.num_fingers):
-        radius, half, _, _ = pad(hand, finger)
-        area = everything.area[finger, hand.num_taxels :].sum()
-        assert area == pytest.approx(4 * np.pi * radius * (radius + half), rel=0.02)
-
-
-def test_points_lie_on_the_surface_and_look_outward(hand, surface):
-    for finger in range(1, hand.num_fingers):
-        radius, half, centre, axis = pad(hand, finger)
-        mine = np.flatnonzero(surface.area[finger, hand.num_taxels :] > 0) + hand.num_taxels
-        away = surface.position[finger, mine] - centre
-        along = np.clip(away @ axis, -half, half)
-        off = away - along[:, None] * axis
-        length = np.linalg.norm(off, axis=1)
-        np.testing.assert_allclose(length, radius, atol=1e-5)
-        assert np.all(np.einsum("ij,ij->i", off / length[:, None], surface.normal[finger, mine]) > 0.999)
 
 
 def test_areas_add_up_to_the_fingertips(hand):
@@ -150,20 +125,6 @@ def test_fingertips_are_as_stiff_as_all_of_their_skin(hand, stiffness, depth):
     np.testing.assert_allclose(found[6:11], wanted, rtol=0.1)
 
 
-def test_taxels_come_first_and_keep_their_place(hand, surface):
-    n = hand.num_taxels
-    for mine, theirs in (
-        (surface.position, hand.taxel_position),
-        (surface.normal, hand.taxel_normal),
-        (surface.area, hand.taxel_area),
-    ):
-        np.testing.assert_array_equal(mine[:, :n], theirs)
-    for finger in range(hand.num_fingers):
-        bare = surface.position[finger, n:][surface.area[finger, n:] > 0]
-        gap = np.linalg.norm(bare[:, None] - hand.taxel_position[finger], axis=-1).min(1)
-        assert gap.min() > 0.8 * REACH
-
-
 def press(hand, surface, finger, point, normal, total=5.0, depth=0.001):
     """What a finger's taxels read in all, and all its points, when a ball of 10 mm presses at `point` of its link."""
     pose = forward_kinematics(hand, jnp.asarray((hand.joint_lower + hand.joint_upper) / 2))
@@ -180,101 +141,3 @@ def test_in_the_middle_of_the_pad_taxels_bear_everything(hand, surface):
         middle = np.argmin(np.linalg.norm(hand.taxel_position[finger] - hand.taxel_position[finger].mean(0), axis=1))
         at = hand.taxel_position[finger, middle], hand.taxel_normal[finger, middle]
         assert press(hand, surface, finger, *at)[0] == pytest.approx(5.0, rel=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("finger", [1, 4])
-def test_round_the_pad_less_and_less_is_felt(hand, surface, finger):
-    radius, _, centre, _ = pad(hand, finger)
-    front, side = facing(hand, finger)
-    felt, everything = [], []
-    for angle in np.linspace(0, np.pi, 13):
-        normal = np.cos(angle) * front + np.sin(angle) * side
-        read, total = press(hand, surface, finger, centre + radius * normal, normal)
-        felt.append(read)
-        everything.append(total)
-    np.testing.assert_allclose(everything, 5.0, rtol=1e-4)  # somewhere the load is borne
-    assert felt[0] == pytest.approx(5.0, rel=1e-3) and felt[-1] == 0.0
-    assert np.all(np.diff(felt) < 0.25)
-    assert any(0.5 < x < 4.5 for x in felt), felt
-    # By the taxels alone, as in the paper, it is all or nothing.
-    alone = [
-        press(hand, taxels_only(hand), finger, centre + radius * n, n)[0]
-        for n in (np.cos(a) * front + np.sin(a) * side for a in np.linspace(0, np.pi, 13))
-    ]
-    assert all(x == 0.0 or x == pytest.approx(5.0, rel=1e-4) for x in alone)
-
-
-@pytest.fixture(scope="module")
-def environments():
-    """The same grasp without and with bare skin, and a first state."""
-    plain = GraspConfig(
-        pool_size=64,
-        objects=ObjectConfig(shapes=("sphere",)),
-        skin=Skin(total="solver"),
-    )
-    bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, untaxelled=True))
-    first, second = (dexsim.make("grasp", config, backend="c") for config in (plain, bare))
-    return first, second, first.reset(jax.random.key(0))
-
-
-def touched(environments, hand, angle):
-    """What both feel of a ball at an angle from the middle of the index finger's pad, 3 N into it, 1.5 N across."""
-    *both, state = environments
-    pose = forward_kinematics(hand, state.physics.qpos[both[0].physics.joint_qpos])
-    radius, _, centre, axis = pad(hand, 1)
-    front, side = facing(hand, 1)
-    direction = np.cos(angle) * front + np.sin(angle) * side
-    direction = pose.tip_rotation[1] @ jnp.asarray(direction, jnp.float32)
-    size = float(state.episode.object.size[np.flatnonzero(np.asarray(state.episode.object.active))[0], 0])
-    place = (
-        pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre) + direction * (radius + size)
-    )
-    physics = dataclasses.replace(state.physics, qpos=state.physics.qpos.at[both[0].physics.object_qpos[:3]].set(place))
-    along = pose.tip_rotation[1] @ jnp.asarray(axis, jnp.float32)
-    force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction + 1.5 * along)
-    return [ground_truth(env, state.episode.object, physics, force) for env in both]
-
-
-@pytest.mark.slow
-def test_an_environment_reads_no_more_than_without(environments, hand):
-    """The same state with and without: taxels are as deep, and each finger reads at most as much."""
-    plain, bare = touched(environments, hand, 0.0)
-    assert plain.touch.force.shape == bare.touch.force.shape == (hand.num_fingers, hand.num_taxels)
-    np.testing.assert_array_equal(plain.touch.depth, bare.touch.depth)
-    sums = [np.asarray(truth.touch.force.sum(-1)) for truth in (plain, bare)]
-    assert sums[0][1] > 1.0 and np.all(sums[1] <= sums[0] + 1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("angle, least, most", [(0.0, 0.99, 1.0), (2.1, 0.05, 0.9), (2.9, 0.0, 0.0)])
-def test_taxels_read_their_share_of_the_load(environments, hand, angle, least, most):
-    """All of it on the pad, a part beside it, nothing on the back."""
-    plain, bare = touched(environments, hand, angle)
-    share = float(bare.touch.force[1].sum() / jnp.maximum(plain.touch.force[1].sum(), 1e-6))
-    assert least <= share <= most + 1e-5
-
-
-def test_it_can_be_asked_for_by_name():
-    assert override(to_dict(GraspConfig()), ("skin.untaxelled=true",))["skin"]["untaxelled"] is True
-
-
-def test_fingertips_of_other_shapes(hand):
-    """Boxes by their faces' area; a finger without primitives has its taxels alone."""
-    taxels = hand.taxel_position - np.float32([0, 0, 1.0])  # far from all of it
-    sides = np.float32([0.006, 0.0004, 0.010])  # a blade: both faces in one cell
-    blade = dataclasses.replace(
-        hand.geoms[0],
-        kind="box",
-        size=sides,
-        position=np.zeros(3, np.float32),
-        rotation=np.eye(3, dtype=np.float32),
-        body=int(hand.tip_body[0]),
-        touches=True,
-    )
-    other = dataclasses.replace(hand, geoms=(blade,), taxel_position=taxels)
-    skin = whole_surface(other, REACH)
-    n = hand.num_taxels
-    a, b, c = 2e3 * sides
-    assert skin.area[0, n:].sum() * 1e6 == pytest.approx(2 * (a * b + b * c + a * c), rel=0.15)
-    assert np.isfinite(skin.normal).all() and not skin.area[1:, n:].any()

@@ -134,12 +134,6 @@ def test_termination_wins_over_truncation():
     assert states.done[5].all() and not states.info["truncation"].any()
 
 
-def test_trainer_limit_truncates_too():
-    states = run(wrap(BraxEnv(PointEnv()), episode_length=4), jnp.zeros((2, 1)))
-    assert np.flatnonzero(states.done[:, 0]).tolist() == [3, 7, 11]
-    assert states.info["truncation"][[3, 7, 11]].all()
-
-
 def test_standard_wrappers():
     env = training.wrap(BraxEnv(PointEnv()), episode_length=6)
     states = run(env, jnp.array([[1.0], [0.0]]))
@@ -147,11 +141,6 @@ def test_standard_wrappers():
     assert stayed.tolist() == [5, 11] and states.info["truncation"][stayed, 1].all()
     # Each environment goes back to its own first state, as brax does it.
     assert len(set(states.obs["actor"][stayed, 1, 0].tolist())) == 1
-
-
-def test_randomization_fn_is_refused():
-    with pytest.raises(ConfigError, match="randomization_fn"):
-        wrap(BraxEnv(PointEnv()), 10, randomization_fn=lambda *_: None)
 
 
 def train(env, num_timesteps, **options):
@@ -182,26 +171,6 @@ def train(env, num_timesteps, **options):
 
 
 @pytest.mark.slow
-def test_ppo_trains_on_a_point():
-    history, params = train(
-        BraxEnv(PointEnv()),
-        num_timesteps=40_000,
-        episode_length=6,
-        num_envs=64,
-        batch_size=64,
-        num_minibatches=2,
-        unroll_length=6,
-        num_eval_envs=64,
-        discounting=0.95,
-        learning_rate=3e-3,
-    )
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
-    first, last = (metrics["eval/episode_reward"] for metrics in (history[0], history[-1]))
-    assert last > first and np.isfinite(last)
-    assert history[-1]["eval/avg_episode_length"] == 6
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["simple", "c"])
 def test_ppo_runs_on_grasp(physics, monkeypatch):
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
@@ -221,33 +190,3 @@ def test_ppo_runs_on_grasp(physics, monkeypatch):
     )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     assert np.isfinite(history[-1]["training/total_loss"])
-
-
-def test_pictures(hand):
-    from dexsim.render.snapshot import Snapshot
-
-    class Posed(PointEnv):
-        primitive_kinds = ("box", "ellipsoid", "capsule")
-
-        def snapshot(self, state):
-            return Snapshot(
-                joint_position=np.full(12, 0.3),
-                object_position=np.array([0.06, 0, 0.1]),
-                object_rotation=np.eye(3),
-                primitive_size=np.full((3, 3), 0.02),
-                primitive_position=np.zeros((3, 3)),
-                primitive_rotation=np.stack([np.eye(3)] * 3),
-                primitive_active=np.array([True, True, False]),
-                taxel_force=np.zeros((5, 120)),
-                command=np.zeros(1),
-                target_force=np.zeros(()),
-                finger_force=np.zeros(5),
-            )
-
-    ours = Posed()
-    ours.hand = hand
-    env = BraxEnv(ours)
-    state = env.reset(jax.random.PRNGKey(0))
-    trajectory = [state, env.step(state, jnp.ones(1))]
-    (picture, _) = env.render(trajectory, height=120, width=240)
-    assert picture.shape == (120, 240, 3) and picture.dtype == np.uint8 and picture.std() > 5

@@ -54,12 +54,7 @@ def test_seeds_repeat_and_without_one_the_numbers_go_on():
 
 
 def test_what_does_not_fit_is_one_line():
-    for count, group, message in ((0, "actor", "num_envs = 0"), (2, "eyes", "no observation group .eyes.: choose")):
-        with pytest.raises(ConfigError, match=message):
-            GymVectorEnv(TinyEnv(), count, group)
-    env = GymVectorEnv(TinyEnv(), 1)
+    with pytest.raises(ConfigError, match="no observation group .eyes.: choose"):
+        GymVectorEnv(TinyEnv(), 2, "eyes")
     with pytest.raises(ConfigError, match="reset the environment before"):
-        env.step(np.zeros((1, 1)))
-    env.reset(seed=0)
-    with pytest.raises(ConfigError, match=r"the actions have the shape \(1,\), expected \(1, 1\)"):
-        env.step(np.zeros(1))
+        GymVectorEnv(TinyEnv(), 1).step(np.zeros((1, 1)))
