@@ -76,7 +76,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
     """Field by field: an option that is added later is part of the training, unless this list grows with it."""
     _, begun = train.parse_arguments(["--resume", str(finished.path)])
     saved = train.default_arguments(None, "auto", begun)
-    other = {"seed": 9, "extremes": 0.5, "backend": "mjx", "preset": "gpu", "task": "other", "policy": "grasp"}
+    other = {"seed": 9, "extremes": 0.5, "backend": "c", "preset": "gpu", "task": "other", "policy": "grasp"}
     other |= {"evaluation_share": 0.5, "evaluate_every": 5, "wandb": "mine"}
     other |= {"hand": "mine.toml", "deterministic": True}
     other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
