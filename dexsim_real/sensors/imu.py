@@ -11,9 +11,9 @@ import math
 import struct
 import threading
 import time
-from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dexsim.core.install import install_line
 from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
@@ -52,16 +52,8 @@ def decode(frame: bytes) -> np.ndarray | None:
     _, yaw, pitch, roll, *_ = _BODY.unpack(body)
     if abs(yaw) > 18000 or abs(pitch) > 9000 or abs(roll) > 18000:
         return None
-    half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
-    (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    quat = Rotation.from_euler("ZYX", [yaw / 100, pitch / 100, roll / 100], degrees=True).as_quat()
+    return np.roll(quat, 1)
 
 
 class RvcParser:
@@ -162,7 +154,14 @@ class Imu(ImuReader):
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
         super().__init__(mount, port)
         self._stop = threading.Event()
-        self._serial = _open(port)
+        try:
+            import serial
+        except ImportError:
+            raise HandError(f"pyserial is missing: {install_line('real')}") from None
+        try:
+            self._serial = serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
+        except PORT_ERRORS as error:
+            raise HandError(explain(port, error)) from None
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
 
@@ -192,14 +191,3 @@ class Imu(ImuReader):
             except OSError:
                 return  # `Safety` reacts to the age of the last sample.
             self.receive(time.monotonic(), data)
-
-
-def _open(port: str) -> Any:
-    try:
-        import serial
-    except ImportError:
-        raise HandError(f"pyserial is missing: {install_line('real')}") from None
-    try:
-        return serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
-    except PORT_ERRORS as error:
-        raise HandError(explain(port, error)) from None

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -49,7 +48,7 @@ def make_readings(
       command: grip command in [0, 1].
       last_action: [J] the action that led to these measurements.
     """
-    known = {
+    values = {
         "joint_position": measured.joint_position,
         "joint_torque": measured.joint_torque,
         "taxel_force": measured.taxel_force,
@@ -60,5 +59,4 @@ def make_readings(
         "command": command,
         "last_action": last_action,
     }
-    arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in known.items()}
-    return Readings(**arrays)
+    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.current import Motor, motor_current, read_current
-from dexsim.calibration.virtual_press import press
 
 MOTOR = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.03)
 
@@ -56,29 +55,6 @@ def test_the_reading_has_bias_noise_steps_and_an_end():
     assert np.abs(reading).max() == pytest.approx(0.03)
     quiet = Motor(torque_constant=0.5)
     assert float(read_current(jax.random.key(0), quiet, jnp.float32(0.123))) == pytest.approx(0.123, rel=1e-6)
-
-
-def test_a_press_is_a_triangle_of_force_and_the_motors_current():
-    data = press(
-        Motor(torque_constant=0.5, no_load_current=0.01),
-        jax.random.key(0),
-        lever=0.06,
-        peak=6.0,
-        cycles=2,
-        samples=400,
-        force_resolution=0.1,
-        force_limit=5.0,
-    )
-    assert data.force.max() == 5.0 and data.force.min() == 0.0
-    np.testing.assert_allclose(data.force * 10, np.round(data.force * 10), atol=1e-6)
-    rising = np.arange(400) % 200 < 100
-    exact = 6.0 * (1 - np.abs(2 * (np.arange(400) / 200 % 1) - 1))
-    np.testing.assert_allclose(data.value, exact * 0.06 / 0.5 + np.where(rising, 0.01, -0.01), atol=1e-6)
-
-
-def test_a_joint_that_presses_by_turning_back_draws_the_mirrored_current():
-    there, back = (press(MOTOR, jax.random.key(0), lever=lever) for lever in (0.06, -0.06))
-    np.testing.assert_allclose(back.value, -there.value, atol=1e-6)
 
 
 def test_gradients_reach_every_parameter():

@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.stats
+from virtual_press import press
 
 from dexsim.actuator.current import Motor
 from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import MIN_FORCE_RANGE, MIN_SAMPLES, JointPress, find_direction, fit_joint
+from dexsim.calibration.joint import JointPress, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
     current_from_counts,
@@ -24,8 +25,7 @@ from dexsim.calibration.maps import (
     taxel_force,
 )
 from dexsim.calibration.plot import plot_calibration
-from dexsim.calibration.press import lever_arms, simulated_press
-from dexsim.calibration.virtual_press import press
+from dexsim.calibration.press import MIN_LEVER, lever_arms
 from dexsim.core.errors import CalibrationError
 from dexsim.core.robust_line import fit_line, long_run, theil_sen
 
@@ -242,9 +242,13 @@ def test_alignment_tells_where_the_papers_maxima_mislead(hand):
 
 def test_joints_without_a_recording_take_their_class(hand):
     some = ("thumb_bend", "thumb_rota2", "index_joint1", "index_joint2")
-    with pytest.raises(CalibrationError, match="thumb_rota1: no recording on the hand side"):
-        calibrated(hand, names=some)
-    calibration, *_ = calibrated(hand, names=some, missing="class")
+    with pytest.raises(CalibrationError, match="thumb_rota1: no recording of any joint with 0.4 Nm to take over"):
+        calibrated(hand, names=("thumb_bend",))
+    with pytest.raises(CalibrationError, match="no joint 'elbow'"):
+        calibrate(hand, {"elbow": recording()}, {})
+    with pytest.raises(CalibrationError, match="calibration: thumb: force_per_count = 2: must be between"):
+        calibrated(hand, names=some, force_per_count=2.0)  # What could not be read again is not made.
+    calibration, *_ = calibrated(hand, names=some)
     strong, weak = [0, 4], [2, 5]
     for joint, name in enumerate(hand.joint_names):
         if name not in some:
@@ -257,22 +261,15 @@ def test_joints_without_a_recording_take_their_class(hand):
 SOME = ("thumb_bend", "index_joint1", "index_joint2", "index_bend")
 
 
-def test_what_could_not_be_read_again_is_not_made(hand):
-    with pytest.raises(CalibrationError, match="calibration: thumb: force_per_count = 2: must be between"):
-        calibrated(hand, names=SOME, missing="class", force_per_count=2.0)
-    with pytest.raises(CalibrationError, match="calibration: current_per_count = 1: must be between"):
-        calibrated(hand, names=SOME, missing="class", current_per_count=1.0)
-
-
 @pytest.mark.parametrize("side", ["on the hand", "in simulation"])
 def test_a_class_of_both_signs_has_no_mean(hand, side):
-    _, *sides = calibrated(hand, names=SOME, missing="class")
+    _, *sides = calibrated(hand, names=SOME)
     turned = sides[side == "in simulation"]
     turned["index_joint2"] = dataclasses.replace(turned["index_joint2"], value=-turned["index_joint2"].value)
     with pytest.raises(
-        CalibrationError, match=f"index_joint2: its gain {side} .* index_bend: .* or record [a-z_0-9]+$"
+        CalibrationError, match=f"gain signs differ {side} between index_joint2 and index_bend: .* record "
     ):
-        calibrate(hand, *sides, missing="class")
+        calibrate(hand, *sides)
 
 
 def test_what_the_data_cannot_separate_is_said(fitted):
@@ -284,9 +281,6 @@ def test_what_the_data_cannot_separate_is_said(fitted):
     one_way = fit_joint(only, "A")
     assert one_way.unloading is None and math.isnan(one_way.friction)
     assert any("friction and offset are not apart" in note for note in one_way.notes)
-    force = np.linspace(8.0, 8.8, 400)
-    narrow = fit_joint(JointPress(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
-    assert any("gain and offset trade off" in note for note in narrow.notes)
 
 
 # --- loading and unloading ----------------------------------------------------------------------
@@ -312,52 +306,27 @@ def test_a_single_ramp_is_one_direction():
 # --- refusals -----------------------------------------------------------------------------------
 
 
-def broken(**changes):
+BAD = {
+    "at least 20": lambda f, v: (f[:10], v[:10]),
+    "at least 20 samples of rising": lambda f, v: (f[:21], v[:21]),
+    "one length": lambda f, v: (f[:-1], v),
+    "not a number": lambda f, v: (np.where(np.arange(600) == 3, np.inf, f), v),
+    "force stays between 4.* press": lambda f, v: (4 + 0.02 * f, v),
+    "does not follow the force": lambda f, v: (f, 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)),
+    "value sits at its maximum .* saturated": lambda f, v: (f, np.minimum(v, 0.05)),
+    "force sits at its maximum .* saturated": lambda f, v: (np.minimum(f, 2.0), v),
+    "give A, not counts": lambda f, v: (f, 1000 * v),
+    "give N, not counts": lambda f, v: (1000 * f, v),
+    "mixed up": lambda f, v: (f, v * np.where(np.arange(600) % 200 < 100, 1, -1)),
+}
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_bad_recordings_are_refused_in_one_line(says):
     data = recording()
-    force, value = data.force.copy(), data.value.copy()
-    for name, change in changes.items():
-        force, value = {
-            "force": lambda f, v, c=change: (c(f), v),
-            "value": lambda f, v, c=change: (f, c(v)),
-            "both": lambda f, v, c=change: (c(f), c(v)),
-        }[name](force, value)
-    return JointPress(force, value)
-
-
-def put(index, number):
-    def change(array):
-        array[index] = number
-        return array
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"both": lambda a: a[:10]}, "10 samples: at least 20"),
-        ({"both": lambda a: a[:21]}, "18 samples loading and 0 unloading: at least 20"),
-        ({"force": lambda f: f[:-1]}, "one length"),
-        ({"value": put(17, np.nan)}, "sample 17 is not a number .*leave out"),
-        ({"force": put(3, np.inf)}, "sample 3 is not a number"),
-        ({"force": lambda f: 4 + 0.02 * f}, "force stays between 4.* press"),
-        (
-            {"value": lambda v: 0 * v + 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)},
-            "does not follow the force",
-        ),
-        ({"value": lambda v: np.minimum(v, 0.05)}, "saturated"),
-        ({"force": lambda f: np.minimum(f, 2.0)}, "saturated"),
-        ({"value": lambda v: 1000 * v}, "give it in A"),
-        ({"value": lambda v: np.where(np.arange(600) < 200, 1000 * v, v)}, "give it in A|mixed"),
-        ({"value": lambda v: np.where(np.arange(600) < 90, 1000 * v, v)}, "mixed"),
-        ({"force": lambda f: 1000 * f}, "force of .* N: give it in N"),
-        ({"force": lambda f: f - 5}, "tare"),
-    ],
-)
-def test_bad_recordings_are_refused_in_one_line(changes, says):
-    with pytest.raises(CalibrationError, match=says) as caught:
-        fit_joint(broken(**changes), "A", where="thumb_bend on the hand")
-    assert "\n" not in str(caught.value) and str(caught.value).startswith("thumb_bend on the hand")
+    with pytest.raises(CalibrationError, match=f"^thumb_bend on the hand.*{says}") as error:
+        fit_joint(JointPress(*BAD[says](data.force, data.value)), "A", where="thumb_bend on the hand")
+    assert "\n" not in str(error.value)
 
 
 def test_a_few_saturated_samples_are_left_out():
@@ -367,11 +336,6 @@ def test_a_few_saturated_samples_are_left_out():
     assert fit.loading.gain == pytest.approx(LEVER / (0.9 * 0.8), rel=0.02)
     unclipped = fit_joint(recording(seed=1), "A")
     assert not any("saturated" in note for note in unclipped.notes)
-
-
-def test_names_that_the_hand_does_not_have(hand):
-    with pytest.raises(CalibrationError, match="no joint 'elbow'"):
-        calibrate(hand, {"elbow": recording()}, {})
 
 
 # --- file ---------------------------------------------------------------------------------------
@@ -389,13 +353,6 @@ def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
     assert 'name = "thumb_bend"' in text and "# A" in text  # for people too
 
 
-def test_a_missing_direction_survives_the_file(hand, fitted, tmp_path):
-    nan = np.full(12, np.nan)
-    one_way = dataclasses.replace(fitted[0], real=dataclasses.replace(fitted[0].real, friction=nan))
-    save_calibration(tmp_path / "c.toml", one_way)
-    assert np.all(np.isnan(load_calibration(tmp_path / "c.toml", hand).real.friction))
-
-
 def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
     path = tmp_path / "c.toml"
     save_calibration(path, fitted[0])
@@ -405,30 +362,6 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         with pytest.raises(CalibrationError) as caught:
             load_calibration(path, hand)
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("version = 1", "version = 2", "is of version 2, this library reads up to 1: upgrade"),
-        ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
-        ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
-        ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
-        ("torque_scale = 1.1", "torque_scale = 0.0", "thumb_bend: torque_scale = 0: must be between"),
-        ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
-        ("friction = ", "fiction = ", "'friction' must hold 1 number"),
-        ("complete = true", "complete = false", "cut off"),
-    ],
-)
-def test_other_files_are_refused_in_one_line(hand, fitted, tmp_path, old, new, says):
-    path = tmp_path / "c.toml"
-    save_calibration(path, fitted[0])
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-    with pytest.raises(CalibrationError, match=says) as caught:
-        load_calibration(path, hand)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_and_a_place_that_cannot_be_written(fitted, tmp_path):
@@ -463,10 +396,6 @@ def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
         plot_calibration(path, calibration, {}, sim)
 
 
-def test_thresholds_are_what_the_messages_say():
-    assert MIN_SAMPLES == 20 and MIN_FORCE_RANGE == 0.5
-
-
 # --- the simulation's side --------------------------------------------------------------------------
 
 
@@ -486,28 +415,26 @@ def test_lever_arms_are_c_mujocos(hand):
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jacobian, None, point, body)
         torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
-        wanted = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
-        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), wanted, atol=2e-6)
+        expected = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
+        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), expected, atol=2e-6)
 
 
 def test_a_hand_pressed_finger_by_finger(hand):
     """Both sides from the same presses: each joint's torque comes back through its current."""
     posture = np.clip(np.full(12, 0.5), hand.joint_lower, hand.joint_upper)
-    triangle = 8 * (1 - np.abs(2 * (np.arange(600) / 200 % 1) - 1))
     real, sim, arms = {}, {}, {}
-    for finger in hand.finger_names:
-        for name, data in simulated_press(hand, posture, finger, triangle).items():
-            arm = data.value[50] / data.force[50]
-            if name not in arms or abs(arm) > abs(arms[name]):
-                sim[name], arms[name] = data, arm
+    for finger in range(5):
+        for name, arm in zip(hand.joint_names, lever_arms(hand, posture, finger, 66), strict=True):
+            if abs(arm) >= MIN_LEVER and abs(arm) > abs(arms.get(name, 0.0)):
+                arms[name] = arm
                 real[name] = press(MOTOR, jax.random.key(len(real)), lever=arm, force_noise=0.03)
+                force = real[name].force
+                sim[name] = JointPress(force, force * arm)
     assert len(arms) >= 10 and all(0.005 < abs(arm) < 0.12 for arm in arms.values())
-    found = calibrate(hand, real, sim, missing="class")
+    calibration = calibrate(hand, real, sim)
     for name, arm in arms.items():
         joint = hand.joint_names.index(name)
         current = np.zeros(12)
         current[joint] = 5.0 * arm / (0.9 * 0.8) + math.copysign(0.02, arm) + 0.004
-        direction = np.ones(12)
-        assert float(joint_torque(found, current, direction)[joint]) == pytest.approx(5.0 * arm, rel=0.06), name
-    with pytest.raises(CalibrationError, match="no finger 'toe'"):
-        simulated_press(hand, posture, "toe", triangle)
+        torque = float(joint_torque(calibration, current, np.ones(12))[joint])
+        assert torque == pytest.approx(5.0 * arm, rel=0.06), name
