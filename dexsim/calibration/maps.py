@@ -238,22 +238,26 @@ def _calibration(table: dict[str, Any]) -> Calibration:
     force_per_torque = None
     if "force_per_torque" in table:
         force_per_torque = np.array([_row(table, name, len(fingers)) for name in _FORCE_PER_TORQUE])
+
+    def side(key: str) -> Side:
+        pairs = {name: np.stack([_row(joint[key], name, 2) for joint in joints], -1) for name in _PAIRS}
+        singles = {name: np.concatenate([_row(joint[key], name, 1) for joint in joints]) for name in _SINGLES}
+        return Side(**pairs, **singles)
+
     return Calibration(
-        *(
-            Side(
-                **{name: np.stack([_row(joint[key], name, 2) for joint in joints], -1) for name in _PAIRS},
-                **{name: np.concatenate([_row(joint[key], name, 1) for joint in joints]) for name in _SINGLES},
-            )
-            for key in ("real", "sim")
-        ),
-        torque_scale=np.concatenate([_row(joint, "torque_scale", 1) for joint in joints]),
-        force_per_count=_row(table, "force_per_count", len(fingers)),
+        side("real"),
+        side("sim"),
+        np.concatenate([_row(joint, "torque_scale", 1) for joint in joints]),
+        _row(table, "force_per_count", len(fingers)),
+        hand=str(table["hand"]),
         joint_names=tuple(str(joint["name"]) for joint in joints),
         finger_names=fingers,
         current_per_count=float(table["current_per_count"]),
+        serial=str(table["serial"]),
+        handedness=str(table["handedness"]),
+        created=str(table["created"]),
         notes=tuple(map(str, table["notes"])),
         force_per_torque=force_per_torque,
-        **{name: str(table[name]) for name in ("hand", "serial", "handedness", "created")},
     )
 
 

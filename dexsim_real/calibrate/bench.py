@@ -164,7 +164,7 @@ class Bench(ExchangeLoop):
             raise HandError(f"no usable answer in {seconds:g} s; check the cable")
         return answered
 
-    def tare(self, exchanges: list[Exchange]) -> None:
+    def set_zero(self, exchanges: list[Exchange]) -> None:
         """Tare the taxels with exchanges of an untouched hand.
 
         Raises:

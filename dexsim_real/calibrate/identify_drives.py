@@ -104,7 +104,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep clear of them")
     with stopping(), Bench(arguments, hand, operator, TASK, **bench) as work:
         try:
-            work.tare(work.collect(_TARE))  # Otherwise `Safety` would mistake the taxels' zero error for a touch.
+            work.set_zero(work.collect(_TARE))  # Otherwise `Safety` would mistake the taxels' zero error for a touch.
             if not operator.assume_yes and operator.ask("  Enter starts, s stops:", work.step).lower() in ("s", "stop"):
                 raise HandError("stopped before anything moved")
             work.await_motors()

@@ -72,7 +72,7 @@ class PressProcedure:
         if len(exchanges) < _ANSWERED * self.bench.arguments.rate * _REST:
             raise HandError(f"only {len(exchanges)} answers in {_REST:g} s; check the cable, or close other programs")
         counts = np.array([self.bench.sensing.counts(exchange.state) for exchange in exchanges])
-        self.bench.tare(exchanges)
+        self.bench.set_zero(exchanges)
         for finger, name in enumerate(self.hand.finger_names):
             check_steady(name, counts[:, finger].sum(-1))
             noise = counts[:, finger].std(0)
@@ -139,7 +139,7 @@ class PressProcedure:
         """
         pause, target = self.config.pause, self._target()
         self.bench.collect(pause, target)
-        self.bench.tare(self.bench.collect(pause, target))
+        self.bench.set_zero(self.bench.collect(pause, target))
         free = [self._force(exchange) for exchange in self.bench.collect(pause, target)]
         self._touch = max(_TOUCH, float(np.mean(free) + 6 * np.std(free)))
 

@@ -48,8 +48,8 @@ class HardwareConfig(Config):
     tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
     """Count above which a taxel cannot be tared: alone it is stuck, and several adjacent ones touch something."""
     tare_sum: float = setting(50.0, unit="count", low=0.0, high=30600.0)
-    """Largest sum of a fingertip's counts when it is tared, single taxels left out: the largest load that taring can
-    hide, 5 N by the vendor's 0.1 N."""
+    """Largest sum of a fingertip's counts when it is tared: the largest load that taring can hide, 5 N by the vendor's
+    0.1 N."""
     track_zero: bool = True
     """Follow the zero of taxels that touch nothing, which wanders with temperature; `tare_sum` bounds it, too."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)

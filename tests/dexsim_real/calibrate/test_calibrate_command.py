@@ -129,7 +129,7 @@ def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session
         ({"task": "grasp"}, "this is a log of 'grasp'; give one of 'calibrate'"),
     ):
         with pytest.raises(LogError, match=says):
-            read_presses([session[2], changed(session[2], tmp_path / "other.log", **values)], hand)
+            read_presses([session[2], changed(session[2], tmp_path / f"{list(values)[0]}.log", **values)], hand)
     for name, kind, content, says in (
         ("early", Kind.NOTE, "end: no answer", "ends before the hand was ready"),
         ("forged", Kind.META, {"task": "calibrate"}, "KeyError"),

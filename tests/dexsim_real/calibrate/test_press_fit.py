@@ -22,6 +22,7 @@ from dexsim_real.calibrate.press_fit import fit
 from dexsim_real.calibrate.read import PressSession, Recording, Source, read_presses
 from dexsim_real.calibrate.report import torque_constants
 from dexsim_real.core.log import Kind, LogReader, LogWriter
+from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.identity import Identity
 
 GAIN, ZERO = 8.0, 20.0  # counts per newton, counts at zero force
@@ -268,7 +269,7 @@ def pressed(forces, hand, dead=()):
             press.shown.append(float(counts.sum()))
             press.position.append(np.zeros(12))
         press.gauge[f"level {level}"] = float(force)
-    source = Source(CalibrateArguments(port="x", output="none").hardware, 83.0, Identity())
+    source = Source(HardwareConfig(), 83.0, Identity())
     return force_scale(PressSession(source, {}), hand, [press]).newtons["index pad"]
 
 
