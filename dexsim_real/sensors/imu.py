@@ -129,14 +129,14 @@ class ImuReader:
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
-        self._index, self._far = -1, 0
+        self._last_index, self._far = -1, 0
 
     def receive(self, time: float, data: bytes) -> None:
         """Update with bytes that were received at a time in s."""
         for index, quat in self.parser.feed(data):
-            if index == self._index:
+            if index == self._last_index:
                 continue
-            self._index = index
+            self._last_index = index
             when, before = self._newest or (time, quat)
             angle = 2.0 * math.acos(min(abs(float(quat @ before)), 1.0))
             self._far = self._far + 1 if angle > _JUMP + _FASTEST * (time - when) else 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -59,4 +60,5 @@ def make_readings(
         "command": command,
         "last_action": last_action,
     }
-    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})
+    arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in values.items()}
+    return Readings(**arrays)

@@ -9,7 +9,6 @@ from pty_hand import QUICK, PtyHand
 
 pytest.importorskip("serial")
 
-from dexsim.calibration.maps import load_calibration, save_calibration
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
@@ -76,15 +75,6 @@ def test_the_hand_of_the_calibration_passes_and_what_is_unknown_is_told(hand):
         (note,) = check_identity(None, hand, known)
         assert "does not tell its serial number" in note
     assert "code 1" in check_identity(Identity("A001", "code 1"), hand, None)[0]
-
-
-def test_the_calibration_file_keeps_both_and_an_older_one_names_no_side(hand, tmp_path):
-    path = tmp_path / "hand.toml"
-    save_calibration(path, calibration(hand))
-    found = load_calibration(path, hand)
-    assert (found.serial, found.handedness) == ("2R32A001", "right")
-    path.write_text("".join(line for line in path.read_text().splitlines(True) if not line.startswith("handedness")))
-    assert load_calibration(path, hand).handedness == ""
 
 
 def test_the_driver_asks_at_start():
