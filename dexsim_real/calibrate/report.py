@@ -7,21 +7,22 @@ from dexsim.calibration.maps import Calibration
 from dexsim_real.calibrate.press_fit import Fit
 
 
-def torque_constants(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Torque constants [2, J] Nm/A at the joint, loading and unloading, and their 95 % intervals [2, J, 2].
+def torque_constants(calibration: Calibration) -> np.ndarray:
+    """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
+    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
 
-    The ratio of the gains; the widths of both sides are added in quadrature.
-    """
-    real, sim = calibration.real, calibration.sim
-    value = np.asarray(sim.gain) / np.asarray(real.gain)
-    share = np.hypot(*(np.asarray(side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in (real, sim)))
-    return value, value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])
+
+def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
+    """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
+    sides, value = (calibration.real, calibration.sim), torque_constants(calibration)
+    share = np.hypot(*(np.asarray(side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in sides))
+    return value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])
 
 
 def table(fit: Fit) -> Table:
     """A table with one row per joint. A cell has loading / unloading, or the worse of the two."""
     calibration, real = fit.calibration, fit.calibration.real
-    constants, intervals = torque_constants(calibration)
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
     heads = ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "max force")
     rows = Table(*heads, box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading")

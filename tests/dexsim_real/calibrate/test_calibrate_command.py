@@ -1,18 +1,10 @@
-"""The command: options, files, and the emulated hand."""
+"""The command: options and files."""
 
-import json
 import re
-import signal
-import subprocess
-import sys
-import time
 
-import mujoco
 import numpy as np
-import press_bench
 import pytest
-from calibrating import arguments, operator, record
-from paths import ROOT
+from calibrating import arguments, operator
 from pty_hand import PtyHand
 
 from dexsim.calibration.maps import load_calibration
@@ -22,7 +14,6 @@ from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.read import read_presses
-from dexsim_real.calibrate.report import torque_constants
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
@@ -138,72 +129,3 @@ def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session
             log.add(kind, content)
         with pytest.raises(LogError, match=says):
             read_presses([log.path], hand)
-
-
-# --- the emulated hand -------------------------------------------------------------------------
-
-
-def torque_of(plant, joint):
-    """Torque Nm that a joint must hold against the pen: J^T f by C MuJoCo, of the true contacts."""
-    scene, data, jacobian, torque = plant._scene, plant._data, np.zeros((3, plant._scene.model.nv)), 0.0
-    for finger, point, normal, tangent in plant._touches:
-        mujoco.mj_jac(scene.model, data, jacobian, None, point, scene.model.site_bodyid[scene.tip_site[finger]])
-        torque -= jacobian[:, scene.drive_dof[joint]] @ (normal + tangent)
-    return torque
-
-
-def error_of(path, hand, truth):
-    """Relative errors [2, 2] of the torque constants of the middle finger's joints."""
-    constants = -torque_constants(load_calibration(path, hand))[0]
-    true = np.array([truth["loading_nm_per_a"], truth["unloading_nm_per_a"]])
-    return (constants / true)[:, 6:8] - 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
-    """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
-    from virtual_port import VirtualPort
-
-    from dexsim_real.twin.press import PressBench
-
-    plant, readings = PressBench(hand, seed), []
-
-    def gauge():
-        readings.append((plant.gauge(), torque_of(plant, int(hand.root_joint[2]))))
-        return plant.gauge()
-
-    bench, press_bench.GAUGE = VirtualPort(plant), gauge
-    options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
-    fit_and_report(options, hand, [record(bench, hand, options)], operator())
-    error = error_of(options.output, hand, plant.truth())
-    # Its motors warm up by 15 K and so lose 1.5 %; ripple is 3 %; contact and taxels differ by a millimetre.
-    assert np.abs(error).max() < 0.08 and abs(error.mean()) < 0.05
-    force, torque = np.array(readings)[np.array(readings)[:, 0] > 3.0].T
-    calibration = load_calibration(options.output, hand)
-    value, low, high = calibration.force_per_torque[:, 2]
-    assert low < np.mean(force / torque) < high and value == pytest.approx(np.mean(force / torque), rel=0.06)
-    # The scale of the taxels is drawn up to 13 % off, and is known afterwards.
-    assert 0.1 / calibration.force_per_count[2] == pytest.approx(plant.truth()["taxel_gain"][2], rel=0.06)
-
-
-@pytest.mark.slow
-def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
-    """Two processes and a terminal between them."""
-    port, truth, output = tmp_path / "port", tmp_path / "truth.json", tmp_path / "hand.toml"
-    options = f"--press --link {port} --imu-link {tmp_path / 'imu'} --parameters nominal --output {truth}".split()
-    twin = subprocess.Popen([sys.executable, "-m", "dexsim_real.twin", *options], cwd=ROOT)
-    try:
-        until = time.monotonic() + 60
-        while not port.exists() and time.monotonic() < until:
-            time.sleep(0.1)
-        options = f"--port {port} --yes --fingers middle --output {output} --log {tmp_path / 'hand.log'}".split()
-        run = [sys.executable, "-m", "dexsim_real.calibrate", *options]
-        done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-    finally:
-        twin.send_signal(signal.SIGINT)
-        twin.wait(30)
-    report = json.loads(truth.read_text())
-    assert np.abs(error_of(output, hand, report["trials"][0])).max() < 0.1
-    assert report["commands"]["outside_limits"] == 0

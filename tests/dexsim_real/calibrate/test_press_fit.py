@@ -20,7 +20,7 @@ from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.press_fit import fit
 from dexsim_real.calibrate.read import PressSession, Recording, Source, read_presses
-from dexsim_real.calibrate.report import torque_constants
+from dexsim_real.calibrate.report import torque_constant_intervals, torque_constants
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.identity import Identity
@@ -37,7 +37,7 @@ def truth_of(bench):
 def test_torque_constants_come_back(hand, session):
     bench, options, _, _ = session
     calibration, truth = load_calibration(options.output, hand), truth_of(session[0])
-    constants, intervals = torque_constants(calibration)
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     joints = [hand.joint_names.index(name) for name in ("index_bend", "index_joint1", "index_joint2")]
     np.testing.assert_allclose(constants[:, joints], truth[:, joints], rtol=0.03)
     assert np.mean(np.abs(constants / truth - 1)[:, joints]) < 0.015
@@ -195,7 +195,7 @@ def test_a_kitchen_scale_gives_the_newtons(hand, scale):
     bench, options, typist = scale
     assert typist.read == 12 and "'five' is not a reading" in typist.getvalue()
     calibration = load_calibration(options.output, hand)
-    np.testing.assert_allclose(torque_constants(calibration)[0][:, 6:8], truth_of(bench)[:, 6:8], rtol=0.03)
+    np.testing.assert_allclose(torque_constants(calibration)[:, 6:8], truth_of(bench)[:, 6:8], rtol=0.03)
     # As a run sees them, counts below the floor are cut off, so that the slope is a little steeper than the taxels'.
     assert calibration.force_per_count[2] == pytest.approx(0.1 / 0.85, rel=0.1)
     notes = "\n".join(calibration.notes)
@@ -212,7 +212,7 @@ def test_without_enough_readings_the_scales_error_is_in_the_intervals(hand, scal
     recording = session.recordings["middle pad"]
     recording.gauge = dict(list(recording.gauge.items())[:readings])
     calibration = fit(session, hand).calibration
-    constants, intervals = torque_constants(calibration)
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     low, high = np.sort(intervals[:, 6:8], -1).transpose(2, 0, 1)
     assert np.all((low < truth) & (truth < high)) and np.all(high - low < 0.8 * np.abs(truth))
     assert np.all(np.abs(constants[:, 6:8] / truth - 1) > 0.1)
@@ -226,10 +226,10 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     """The fit takes all force along the normal; by the taxels' x and y most of it is not."""
     session = read_presses([scale[1].log], hand)
     recording = session.recordings["middle pad"]
-    plain = torque_constants(fit(session, hand).calibration)[1][:, 6]
+    plain = torque_constant_intervals(fit(session, hand).calibration)[:, 6]
     sums = np.array(recording.counts).sum(-1)
     recording.shear = list(np.outer(sums, [0.0, 0.3]))
-    shifted = torque_constants(fit(session, hand).calibration)[1][:, 6]
+    shifted = torque_constant_intervals(fit(session, hand).calibration)[:, 6]
     assert np.all(np.ptp(shifted, -1) > np.ptp(plain, -1))
     recording.shear = list(np.outer(sums, [0.0, 20.0]))
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):

@@ -226,7 +226,7 @@ def test_motors_that_give_no_more_turn_round(hand, tmp_path):
     )
     assert gives < calibration.real.force_max[4] < holds < 7
     truth = bench.constant[4] * bench.efficiency[4]
-    assert -torque_constants(calibration)[0][0, 4] == pytest.approx(truth, rel=0.05)
+    assert -torque_constants(calibration)[0, 4] == pytest.approx(truth, rel=0.05)
 
 
 class Squeezed(BenchHand):
