@@ -1,7 +1,7 @@
 """The exchange loop with a hand: decide, send, sense, judge.
 
 There is one. A run on a hand is this loop in a thread of its own (`LoopThread`), a calibration steps it from its
-procedure (`calibrate.hand_loop`), and a run in virtual time lets the time pass between `request` and `take`
+procedure (`calibrate.bench`), and a run in virtual time lets the time pass between `request` and `take`
 (`twin.virtual`).
 """
 

@@ -3,94 +3,16 @@
 import dataclasses
 import datetime
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
 from dexsim.calibration.joint import JointLines, JointPress, fit_joint
-from dexsim.calibration.maps import Calibration, Side, alignment, check_numbers
+from dexsim.calibration.maps import Calibration, Side, alignment, check_plausible
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand
 
-
-def calibrate(
-    hand: Hand,
-    real: Mapping[str, JointPress],
-    sim: Mapping[str, JointPress],
-    *,
-    force_per_count: float | np.ndarray = 0.1,
-    current_per_count: float = 0.001,
-    missing: str = "refuse",
-    serial: str = "",
-    handedness: str = "",
-    created: str | None = None,
-) -> Calibration:
-    """Fit all joints of a hand.
-
-    Args:
-      hand: names, torque limits.
-      real: by joint name, force against motor current (A).
-      sim: by joint name, force against joint torque (Nm), pressed at the same place.
-      force_per_count: N, scalar or [F]; kept in the file for the taxels.
-      current_per_count: A per reported count; kept in the file.
-      missing: what to do with joints that were not recorded (a fingertip's pad does not load
-        every joint): "refuse", or "class" to take the mean of joints with the same torque limit.
-      serial, handedness, created: kept in the file; `created` is today by default.
-
-    Raises:
-      CalibrationError: names the joint and what data is needed, or a number that no hand gives.
-    """
-    unknown = sorted({*real, *sim} - set(hand.joint_names))
-    if unknown:
-        raise CalibrationError(f"no joint {unknown[0]!r} in hand {hand.name}")
-    if missing not in ("refuse", "class"):
-        raise CalibrationError(f"missing = {missing!r}: choose refuse or class")
-    fits: list[tuple[JointLines, JointLines] | None] = []
-    for name in hand.joint_names:
-        if name in real and name in sim:
-            fits.append(
-                (
-                    fit_joint(real[name], "A", where=f"{name} on the hand"),
-                    fit_joint(sim[name], "Nm", where=f"{name} in simulation"),
-                )
-            )
-        elif missing == "refuse":
-            side = "hand" if name not in real else "simulation"
-            raise CalibrationError(
-                f"{name}: no recording on the {side} side: press its fingertip, "
-                "or take over its torque class with missing='class'"
-            )
-        else:
-            fits.append(None)
-    notes = _GENERAL + tuple(
-        f"{name}: {note}"
-        for name, fit in zip(hand.joint_names, fits, strict=True)
-        if fit
-        for lines in fit
-        for note in lines.notes
-    )
-    (real_side, taken), (sim_side, _) = (_gather(hand, fits, k) for k in (0, 1))
-    real_side = _allow_for_scatter(hand, real_side, sim_side)
-    notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit" for name in taken)
-    scale = np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy()
-    calibration = Calibration(
-        real_side,
-        sim_side,
-        np.round(np.asarray(hand.torque_limit, float), 6),
-        scale,
-        hand=hand.name,
-        joint_names=hand.joint_names,
-        finger_names=hand.finger_names,
-        current_per_count=current_per_count,
-        serial=serial,
-        handedness=handedness,
-        created=created if created is not None else datetime.date.today().isoformat(),
-        notes=notes,
-    )
-    check_numbers("calibration", calibration, hand)  # What is written must be readable.
-    return dataclasses.replace(calibration, notes=notes + _compare(calibration))
-
+_LOSSES = 0.3  # share by which a gear's losses may part the gains of the two directions
 
 _GENERAL = (
     "only the ratio of the two gains is used: an error of the force sensor, if it is the same in "
@@ -101,37 +23,99 @@ _GENERAL = (
 )
 
 
-_LOSSES = 0.3  # share by which a gear's losses may part the gains of the two directions
+def calibrate(
+    hand: Hand,
+    real: Mapping[str, JointPress],
+    sim: Mapping[str, JointPress],
+    *,
+    force_per_count: float | np.ndarray = 0.1,
+    serial: str = "",
+    handedness: str = "",
+    created: str | None = None,
+) -> Calibration:
+    """Fit all joints of a hand.
+
+    Joints that were not recorded on both sides (a fingertip's pad does not load every joint) get the mean of those with
+    the same torque limit, with intervals that allow for it, and a note.
+
+    Args:
+      hand: names, torque limits.
+      real: by joint name, force against motor current (A).
+      sim: by joint name, force against joint torque (Nm), pressed at the same place.
+      force_per_count: N, scalar or [F]; kept in the file for the taxels.
+      serial, handedness, created: kept in the file; `created` is today by default.
+
+    Raises:
+      CalibrationError: names the joint and what data is needed, or a number that no hand gives.
+    """
+    if unknown := sorted({*real, *sim} - set(hand.joint_names)):
+        raise CalibrationError(f"no joint {unknown[0]!r} in hand {hand.name}")
+    fits: dict[int, tuple[JointLines, JointLines]] = {}
+    notes = list(_GENERAL)
+    for joint, name in enumerate(hand.joint_names):
+        if name in real and name in sim:
+            on_hand = fit_joint(real[name], "A", where=f"{name} on the hand")
+            in_sim = fit_joint(sim[name], "Nm", where=f"{name} in simulation")
+            fits[joint] = on_hand, in_sim
+            notes += [f"{name}: {note}" for note in on_hand.notes + in_sim.notes]
+        else:
+            notes.append(f"{name}: not recorded, mean of the joints of its torque limit")
+    real_side = _side(hand, {joint: on_hand for joint, (on_hand, _) in fits.items()}, "on the hand")
+    sim_side = _side(hand, {joint: in_sim for joint, (_, in_sim) in fits.items()}, "in simulation")
+    calibration = Calibration(
+        _allow_for_scatter(hand, real_side, sim_side),
+        sim_side,
+        np.round(np.asarray(hand.torque_limit, float), 6),
+        np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy(),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+        serial=serial,
+        handedness=handedness,
+        created=created if created is not None else datetime.date.today().isoformat(),
+    )
+    check_plausible("calibration", calibration, hand)  # What is written must be readable.
+    notes += [
+        f"{name}: aligning by the maxima alone would be off by {100 * abs(ratio - 1):.0f} %: the two sessions ended "
+        "at different places on their lines"
+        for name, ratio in zip(hand.joint_names, alignment(calibration), strict=True)
+        if not 0.9 < ratio < 1.1
+    ]
+    return dataclasses.replace(calibration, notes=tuple(notes))
 
 
-def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
-    """Arrays of one side, and the joints that got the mean of their class."""
-    measured = {joint: _row(fit[side]) for joint, fit in enumerate(fits) if fit}
-    rows, taken = [], []
-    for joint in range(len(fits)):
-        if joint in measured:
-            rows.append(measured[joint])
-            continue
-        mates = [other for other in measured if hand.torque_limit[other] == hand.torque_limit[joint]]
-        same = [measured[other] for other in mates]
-        if not same:
-            raise CalibrationError(
-                f"{hand.joint_names[joint]}: no recording of any joint with "
-                f"{hand.torque_limit[joint]:g} Nm to take over"
-            )
-        names = hand.joint_names
-        odd = [other for other in mates if np.sign(measured[other]["gain"][0]) != np.sign(same[0]["gain"][0])]
+def _side(hand: Hand, lines: Mapping[int, JointLines], where: str) -> Side:
+    """The arrays of one side; a joint without lines has the mean of those with its torque limit."""
+    measured = {joint: _row(both) for joint, both in lines.items()}
+    rows, names = [], hand.joint_names
+    for joint, limit in enumerate(hand.torque_limit):
+        mates = [joint] if joint in measured else [other for other in measured if hand.torque_limit[other] == limit]
+        if not mates:
+            raise CalibrationError(f"{names[joint]}: no recording of any joint with {limit:g} Nm to take over")
+        odd = [other for other in mates if measured[other]["gain"][0] * measured[mates[0]]["gain"][0] < 0]
         if odd:  # Their mean may be next to nothing.
             raise CalibrationError(
-                f"{names[odd[0]]}: its gain {('on the hand', 'in simulation')[side]} has not the sign of that of "
-                f"{names[mates[0]]}: no mean of both can stand for {names[joint]}; check the wiring, or record "
-                f"{names[joint]}"
+                f"gain signs differ {where} between {names[odd[0]]} and {names[mates[0]]}: no mean of both can stand "
+                f"for {names[joint]}; check the wiring, or record {names[joint]}"
             )
-        taken.append(hand.joint_names[joint])
-        mean = {key: np.mean([row[key] for row in same], 0) for key in same[0]}
-        rows.append(mean | {"samples": np.zeros(2), "outliers": np.zeros(2)})
-    fields: dict[str, Any] = {key: np.stack([row[key] for row in rows], -1) for key in rows[0]}
-    return Side(**fields), taken
+        rows.append({key: np.mean([measured[other][key] for other in mates], 0) for key in measured[mates[0]]})
+        if joint not in measured:
+            rows[-1] |= {"samples": np.zeros(2), "outliers": np.zeros(2)}
+    return Side(**{key: np.stack([row[key] for row in rows], -1) for key in rows[0]})
+
+
+def _row(lines: JointLines) -> dict[str, np.ndarray]:
+    """The fields of `Side` for one joint; a missing line is the other one with 0 samples, off by the gear's losses."""
+    only = lines.loading or lines.unloading
+    assert only is not None, "`fit_joint` refuses a recording without a line"
+    stand_in = dataclasses.replace(only.widened(_LOSSES), samples=0, outliers=0)
+    both = [lines.loading or stand_in, lines.unloading or stand_in]
+    names = ("gain", "offset", "noise", "r_squared", "condition", "samples", "outliers")
+    row = {name: np.array([getattr(line, name) for line in both], float) for name in names}
+    for name in ("gain", "offset"):
+        interval = np.array([getattr(line, f"{name}_interval") for line in both])
+        row[f"{name}_low"], row[f"{name}_high"] = interval.T
+    return row | {name: np.array(getattr(lines, name)) for name in ("friction", "value_max", "force_max")}
 
 
 def _allow_for_scatter(hand: Hand, real: Side, sim: Side) -> Side:
@@ -146,41 +130,8 @@ def _allow_for_scatter(hand: Hand, real: Side, sim: Side) -> Side:
         mates = ratio[:, measured & (limit == limit[joint])]
         count, share = mates.shape[1], np.ones(2)
         if count > 1:
+            # A prediction interval: Student's t for the scatter, and for the mean of `count` joints itself.
             scatter = stdtrit(count - 1, 0.975) * np.std(mates, 1, ddof=1) * np.sqrt(1 + 1 / count)
             share = np.minimum(scatter / np.abs(np.mean(mates, 1)), 1.0)
         half[:, joint] = np.hypot(half[:, joint], share * np.abs(real.gain[:, joint]))
     return dataclasses.replace(real, gain_low=real.gain - half, gain_high=real.gain + half)
-
-
-def _row(lines: JointLines) -> dict[str, np.ndarray]:
-    """The fields of `Side` for one joint; a missing line is the other one with 0 samples, off by the gear's losses."""
-    only = lines.loading or lines.unloading
-    assert only is not None, "`fit_joint` refuses a recording without a line"
-    stand_in = only.widened(_LOSSES)
-    both = [lines.loading or stand_in, lines.unloading or stand_in]
-    measured = np.array([lines.loading is not None, lines.unloading is not None])
-    row = {
-        name: np.array([getattr(line, name) for line in both], float)
-        for name in ("gain", "offset", "noise", "r_squared", "condition", "samples", "outliers")
-    }
-    row["samples"], row["outliers"] = row["samples"] * measured, row["outliers"] * measured
-    for name in ("gain", "offset"):
-        interval = np.array([getattr(line, f"{name}_interval") for line in both])
-        row[f"{name}_low"], row[f"{name}_high"] = interval.T
-    return row | {
-        "friction": np.array(lines.friction),
-        "value_max": np.array(lines.value_max),
-        "force_max": np.array(lines.force_max),
-    }
-
-
-def _compare(calibration: Calibration) -> tuple[str, ...]:
-    notes = []
-    for name, ratio in zip(calibration.joint_names, alignment(calibration), strict=True):
-        if not 0.9 < ratio < 1.1:
-            notes.append(
-                f"{name}: aligning by the maxima alone would be off by "
-                f"{100 * abs(ratio - 1):.0f} %: the two sessions ended at different "
-                "places on their lines"
-            )
-    return tuple(notes)

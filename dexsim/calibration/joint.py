@@ -52,41 +52,41 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
       where: named in errors.
 
     Raises:
-      CalibrationError: too few samples, not a number, no excitation, saturated, mixed units, or
+      CalibrationError: too few samples, not a number, no excitation, saturated, another unit, or
         the value does not follow the force.
     """
     force, value = _checked(press, unit, where)
     direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
     number = find_presses(force) if press.press is None else np.asarray(press.press)
-    free, clipped = _not_saturated(force, value, where)
-    notes = [f"{clipped} saturated samples left out ({unit})"] if clipped else []
+    free = _not_saturated(force, where, "force") & _not_saturated(np.abs(value), where, "value")
     lines: list[Line | None] = []
     for sign, name in ((1, "loading"), (-1, "unloading")):
         keep = free & (direction == sign)
-        lines.append(
-            _fit_direction(force[keep], value[keep], number[keep], f"{where}, {name}")
-            if np.sum(keep) >= MIN_SAMPLES
-            else None
-        )
-    if lines == [None, None]:
-        counts = [int(np.sum(free & (direction == sign))) for sign in (1, -1)]
-        raise CalibrationError(
-            f"{where}: {counts[0]} samples loading and {counts[1]} unloading: "
-            f"at least {MIN_SAMPLES} in a direction are needed"
-        )
-    if lines[0] is not None and lines[1] is not None and lines[0].gain * lines[1].gain < 0:
+        enough = np.sum(keep) >= MIN_SAMPLES
+        lines.append(_fit_direction(force[keep], value[keep], number[keep], f"{where}, {name}") if enough else None)
+    known = [line for line in lines if line is not None]
+    if not known:
+        raise CalibrationError(f"{where}: at least {MIN_SAMPLES} samples of rising or of falling force are needed")
+    if len(known) == 2 and known[0].gain * known[1].gain < 0:
         raise CalibrationError(
             f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
         )
-    notes += _line_notes(lines, unit)
+    notes = _line_notes(lines, unit)
+    if clipped := int(np.sum(~free)):
+        notes.append(f"{clipped} saturated samples left out ({unit})")
     if len(np.unique(number[free & (direction != 0)])) < LEAST_GROUPS:
         notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ ({unit})")
-    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in lines if line is not None], 0)
-    wide = [line and line.widened(press.gain_error) for line in lines]
+    # 4.685: where the bisquare's weight ends, beyond which a sample is an outlier.
+    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in known], 0)
+    friction = float("nan")
+    if len(known) == 2:
+        middle = (np.min(force[sound]) + np.max(force[sound])) / 2
+        friction = float(abs(known[0](middle) - known[1](middle)) / 2)
+    loading, unloading = (line and line.widened(press.gain_error) for line in lines)
     return JointLines(
-        wide[0],
-        wide[1],
-        _friction(lines, force[sound]),
+        loading,
+        unloading,
+        friction,
         float(np.max(np.abs(value[sound]))),
         float(np.max(force[sound])),
         tuple(notes),
@@ -146,94 +146,61 @@ def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
 
 def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
-    marks = [mark for mark in (press.direction, press.press) if mark is not None]
-    if force.ndim != 1 or any(np.shape(array) != force.shape for array in (value, *marks)):
-        raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: give arrays of one length")
+    marks = [np.asarray(mark) for mark in (press.direction, press.press) if mark is not None]
+    if force.ndim != 1 or any(array.shape != force.shape for array in (value, *marks)):
+        raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: expected arrays of one length")
     if len(force) < MIN_SAMPLES:
-        raise CalibrationError(f"{where}: {len(force)} samples: at least {MIN_SAMPLES} in a direction are needed")
-    bad = np.flatnonzero(~(np.isfinite(force) & np.isfinite(value)))
-    if len(bad):
-        raise CalibrationError(
-            f"{where}: sample {bad[0]} is not a number ({len(bad)} of {len(force)}): leave out the reads that failed"
-        )
-    for name, array, limit in (("force", force, "N"), ("value", value, unit)):
+        raise CalibrationError(f"{where}: {len(force)} samples, expected at least {MIN_SAMPLES} in a direction")
+    if not np.all(np.isfinite(force) & np.isfinite(value)):
+        raise CalibrationError(f"{where}: a sample is not a number: leave out the reads that failed")
+    for name, array, given in (("force", force, "N"), ("value", value, unit)):
         typical = float(np.quantile(np.abs(array), 0.75))
-        if typical > _LARGEST[limit]:
-            raise CalibrationError(
-                f"{where}: {name} of {typical:g} {limit}: give it in {limit}, not in counts or thousandths"
-            )
-    _refuse_mixed_units(force, value, where)
-    low, high = np.quantile(force, [0.05, 0.95])
-    if high - low < MIN_FORCE_RANGE:
-        raise CalibrationError(
-            f"{where}: force stays between {low:.3g} and {high:.3g} N: press "
-            f"from contact up over at least {MIN_FORCE_RANGE} N"
-        )
-    if low < -MIN_FORCE_RANGE:
-        raise CalibrationError(f"{where}: force of {low:.3g} N: forces are magnitudes, tare the taxels first")
+        if typical > _LARGEST[given]:
+            raise CalibrationError(f"{where}: {name} of {typical:g} {given}: give {given}, not counts or thousandths")
+    _check_range(force, where)
     return force, value
 
 
-def _refuse_mixed_units(force: np.ndarray, value: np.ndarray, where: str) -> None:
-    """Two crowds of value / force, well over a decade apart, are two units and not outliers."""
-    use = (force > 0) & (value != 0)
-    ratio = np.sort(np.log10(np.abs(value[use]) / force[use]))
-    margin = len(ratio) // 10
-    if margin < 2:
-        return
-    inner = np.diff(ratio)[margin:-margin]
-    if np.max(inner, initial=0.0) > 1.5:
-        raise CalibrationError(
-            f"{where}: two groups of samples {10 ** np.max(inner):.0f} times "
-            "apart: units are mixed, give all in A, Nm and N"
-        )
-
-
-def _not_saturated(force: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, int]:
-    """Which samples are off both ends of their ranges, and how many are not."""
-    free = np.ones(len(force), bool)
-    for name, array in (("force", force), ("value", np.abs(value))):
-        top = array >= np.max(array) * (1 - 1e-9)
-        # A count or two at the maximum is its resolution; a crowd there is a stop.
-        crowd = np.sum(top) > max(0.02 * len(array), 3)
-        neighbours = np.sum(array >= np.max(array) - 0.02 * np.ptp(array)) - np.sum(top)
-        if crowd and np.sum(top) > 3 * neighbours:
-            free &= ~top
-            if np.sum(top) > 0.5 * len(array):
-                raise CalibrationError(
-                    f"{where}: {name} sits at its maximum {np.max(array):.3g} in "
-                    f"{np.sum(top)} of {len(array)} samples: saturated, press "
-                    "more gently or raise the limit"
-                )
-    return free, int(np.sum(~free))
-
-
-def _fit_direction(force: np.ndarray, value: np.ndarray, press: np.ndarray, where: str) -> Line:
+def _check_range(force: np.ndarray, where: str) -> None:
     low, high = np.quantile(force, [0.05, 0.95])
     if high - low < MIN_FORCE_RANGE:
         raise CalibrationError(
-            f"{where}: force only between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
+            f"{where}: force stays between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
         )
-    line = fit_line(force, value, group=press)
-    if line.gain_interval[0] <= 0.0 <= line.gain_interval[1]:
+
+
+def _not_saturated(size: np.ndarray, where: str, name: str) -> np.ndarray:
+    """Mask [T] of the samples below the end of the sensor's range, if they reach it."""
+    highest = np.max(size)
+    top = size >= highest * (1 - 1e-9)
+    # A count or two at the maximum is its resolution; a crowd there is a stop.
+    crowd = np.sum(top) > max(0.02 * len(size), 3)
+    neighbours = np.sum(size >= highest - 0.02 * np.ptp(size)) - np.sum(top)
+    if not (crowd and np.sum(top) > 3 * neighbours):
+        return np.ones(len(size), bool)
+    if np.sum(top) > 0.5 * len(size):
         raise CalibrationError(
-            f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % "
-            f"{line.gain_interval[0]:.3g} to {line.gain_interval[1]:.3g}): "
-            "check joint and finger, press harder or longer"
+            f"{where}: {name} sits at its maximum {highest:.3g} in {np.sum(top)} of {len(size)} samples: saturated, "
+            "press more gently or raise the limit"
+        )
+    return ~top
+
+
+def _fit_direction(force: np.ndarray, value: np.ndarray, press: np.ndarray, where: str) -> Line:
+    _check_range(force, where)
+    line = fit_line(force, value, group=press)
+    low, high = line.gain_interval
+    if low <= 0.0 <= high:
+        raise CalibrationError(
+            f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % {low:.3g} to {high:.3g}): check joint and "
+            "finger, press harder or longer"
         )
     return line
 
 
-def _friction(lines: list[Line | None], force: np.ndarray) -> float:
-    if lines[0] is None or lines[1] is None:
-        return float("nan")
-    middle = (np.min(force) + np.max(force)) / 2
-    return float(abs(lines[0](middle) - lines[1](middle)) / 2)
-
-
 def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
-    notes = []
-    for line, name, other in zip(lines, ("loading", "unloading"), ("unloading", "loading"), strict=True):
+    notes, names = [], ("loading", "unloading")
+    for line, name, other in zip(lines, names, names[::-1], strict=True):
         if line is None:
             notes.append(
                 f"no {name} recorded ({unit}): friction and offset are not apart, the {other} line stands for both"
@@ -242,11 +209,6 @@ def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
         width = (line.gain_interval[1] - line.gain_interval[0]) / 2
         if width > 0.1 * abs(line.gain):
             notes.append(f"{name} gain known to {100 * width / abs(line.gain):.0f} % only ({unit})")
-        if line.condition > 20:
-            notes.append(
-                f"{name}: forces lie close together (condition {line.condition:.0f}): "
-                f"gain and offset trade off ({unit})"
-            )
         if line.outliers > 0.1 * line.samples:
             notes.append(f"{name}: {line.outliers} of {line.samples} samples are outliers ({unit})")
         if line.r_squared < 0.9:

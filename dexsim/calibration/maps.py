@@ -13,7 +13,7 @@ Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloadi
 """
 
 import dataclasses
-import math
+import json
 from pathlib import Path
 from typing import Any
 
@@ -130,10 +130,10 @@ def alignment(calibration: Calibration) -> np.ndarray:
 
     1 where aligning by the maxima, as in the paper, gives the same torque as the lines do.
     """
-    slopes = [
+    real, sim = (
         np.abs(np.mean(side.gain, 0)) * side.force_max / side.value_max for side in (calibration.real, calibration.sim)
-    ]
-    return np.asarray(slopes[0] / slopes[1])
+    )
+    return np.asarray(real / sim)
 
 
 def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
@@ -151,42 +151,25 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
 
 # --- file -----------------------------------------------------------------------------------
 
-_PAIRS = (
-    "gain",
-    "gain_low",
-    "gain_high",
-    "offset",
-    "offset_low",
-    "offset_high",
-    "noise",
-    "r_squared",
-    "condition",
-    "samples",
-    "outliers",
-)
 _SINGLES = ("friction", "value_max", "force_max")
+_PAIRS = tuple(field.name for field in dataclasses.fields(Side) if field.name not in _SINGLES)
 _FORCE_PER_TORQUE = ("force_per_torque", "force_per_torque_low", "force_per_torque_high")
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
-    path = Path(path)
     lines = [
         f"format = {_text(FORMAT)}",
         f"version = {VERSION}",
-        f"hand = {_text(calibration.hand)}",
-        f"serial = {_text(calibration.serial)}",
-        f"handedness = {_text(calibration.handedness)}",
-        f"created = {_text(calibration.created)}",
-        f"current_per_count = {_number(calibration.current_per_count)}  # A",
-        f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
-        f"force_per_count = {_list(calibration.force_per_count)}  # N",
+        *(f"{name} = {_text(getattr(calibration, name))}" for name in ("hand", "serial", "handedness", "created")),
+        f"current_per_count = {_numbers(calibration.current_per_count)}  # A",
+        f"finger_names = {_text(calibration.finger_names)}",
+        f"force_per_count = {_numbers(calibration.force_per_count)}  # N",
     ]
     if calibration.force_per_torque is not None:
         rows = zip(_FORCE_PER_TORQUE, calibration.force_per_torque, strict=True)
-        lines += [f"{name} = {_list(row)}  # N/Nm, 0: not pressed" for name, row in rows]
-    lines.append("notes = [")
-    lines += [f"  {_text(note)}," for note in calibration.notes] + ["]", ""]
+        lines += [f"{name} = {_numbers(row)}  # N/Nm, 0: not pressed" for name, row in rows]
+    lines += ["notes = [", *(f"  {_text(note)}," for note in calibration.notes), "]", ""]
     lines += [
         "# Lines value = gain * force + offset; pairs are [loading, unloading].",
         "# real: value in A. sim: value in Nm. Force in N. Intervals are of 95 %.",
@@ -196,19 +179,25 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         lines += [
             "[[joint]]",
             f"name = {_text(name)}",
-            f"torque_scale = {_number(calibration.torque_scale[joint])}  # Nm",
+            f"torque_scale = {_numbers(calibration.torque_scale[joint])}  # Nm",
         ]
-        for key in ("real", "sim"):
-            side = getattr(calibration, key)
+        for key, side in (("real", calibration.real), ("sim", calibration.sim)):
             lines.append(f"[joint.{key}]")
-            lines += [f"{field} = {_list(getattr(side, field)[:, joint])}" for field in _PAIRS]
-            lines += [f"{field} = {_number(getattr(side, field)[joint])}" for field in _SINGLES]
+            lines += [f"{field} = {_numbers(getattr(side, field)[..., joint])}" for field in (*_PAIRS, *_SINGLES)]
         lines.append("")
     lines += ["[end]", "complete = true", ""]
     try:
-        write_whole(path, ["\n".join(lines).encode()])
+        write_whole(Path(path), ["\n".join(lines).encode()])
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _text(value: str | tuple[str, ...]) -> str:
+    return json.dumps(value, ensure_ascii=False)  # TOML's strings are JSON's.
+
+
+def _numbers(values: Any) -> str:
+    return str(np.asarray(values, float).tolist())
 
 
 def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
@@ -222,226 +211,114 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
       CalibrationError: missing, cut, not a calibration, of a newer version, of another hand, or with a number
         that no hand gives.
     """
-    path = Path(path)
-    table = _read(path)
-    entries = _list_of(path, table, "joint", dict)
-    names = tuple(_field(path, entry, "name", str) for entry in entries)
-    fingers = tuple(_list_of(path, table, "finger_names", str))
-    if hand is not None and (table["hand"], names, fingers) != (hand.name, hand.joint_names, hand.finger_names):
+    try:
+        calibration = _calibration(read_toml(Path(path)))
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        says = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({says:.100})") from None
+    own = calibration.hand, calibration.joint_names, calibration.finger_names
+    if hand is not None and own != (hand.name, hand.joint_names, hand.finger_names):
         raise CalibrationError(
-            f"{path}: is of hand {table['hand']!r:.60} with {len(names)} joints and {len(fingers)} fingers, not of "
+            f"{path}: is of hand {calibration.hand!r:.60} with {len(own[1])} joints and {len(own[2])} fingers, not of "
             f"{hand.name!r} or its joints or fingers: calibrate this hand"
         )
-    calibration = Calibration(
-        _side(path, entries, "real"),
-        _side(path, entries, "sim"),
-        np.array([_numbers(path, entry, "torque_scale")[0] for entry in entries]),
-        np.array(_numbers(path, table, "force_per_count", len(fingers))),
-        hand=table["hand"],
-        joint_names=names,
-        finger_names=fingers,
-        current_per_count=_numbers(path, table, "current_per_count")[0],
-        serial=_field(path, table, "serial", str),
-        handedness=_field(path, {"handedness": "", **table}, "handedness", str),
-        created=_field(path, table, "created", str),
-        notes=tuple(_list_of(path, table, "notes", str)),
-        force_per_torque=_force_per_torque(path, table, len(fingers)),
-    )
-    check_numbers(path, calibration, hand)
+    check_plausible(path, calibration, hand)
     return calibration
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        table = read_toml(path)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise CalibrationError(f"{path}: damaged or cut off ({_line(error)})") from None
-    if table.get("format") != FORMAT:
-        raise CalibrationError(f"{path}: not a calibration file")
-    version = _field(path, table, "version", int)
-    if version > VERSION:
-        raise CalibrationError(
-            f"{path}: is of version {version!s:.20}, this library reads up to {VERSION}: upgrade dexsim"
-        )
-    if table.get("end") != {"complete": True} or not table.get("joint"):
-        raise CalibrationError(f"{path}: cut off: its end is missing")
-    _field(path, table, "hand", str)
-    return table
+def _calibration(table: dict[str, Any]) -> Calibration:
+    """The content of a file; whatever is not as `save_calibration` writes it raises."""
+    if table["format"] != FORMAT or table["version"] != VERSION:
+        raise ValueError(f"it has version {table['version']!r:.20}, this library reads {VERSION}")
+    if table["end"] != {"complete": True}:
+        raise ValueError("its end is missing")
+    joints, fingers = table["joint"], tuple(map(str, table["finger_names"]))
+    force_per_torque = None
+    if "force_per_torque" in table:
+        force_per_torque = np.array([_row(table, name, len(fingers)) for name in _FORCE_PER_TORQUE])
+
+    def side(key: str) -> Side:
+        pairs = {name: np.stack([_row(joint[key], name, 2) for joint in joints], -1) for name in _PAIRS}
+        singles = {name: np.concatenate([_row(joint[key], name, 1) for joint in joints]) for name in _SINGLES}
+        return Side(**pairs, **singles)
+
+    return Calibration(
+        side("real"),
+        side("sim"),
+        np.concatenate([_row(joint, "torque_scale", 1) for joint in joints]),
+        _row(table, "force_per_count", len(fingers)),
+        hand=str(table["hand"]),
+        joint_names=tuple(str(joint["name"]) for joint in joints),
+        finger_names=fingers,
+        current_per_count=float(table["current_per_count"]),
+        serial=str(table["serial"]),
+        handedness=str(table["handedness"]),
+        created=str(table["created"]),
+        notes=tuple(map(str, table["notes"])),
+        force_per_torque=force_per_torque,
+    )
 
 
-def _force_per_torque(path: Path, table: dict[str, Any], fingers: int) -> np.ndarray | None:
-    if not any(name in table for name in _FORCE_PER_TORQUE):
-        return None  # a file from before
-    return np.array([_numbers(path, table, name, fingers) for name in _FORCE_PER_TORQUE])
-
-
-def _side(path: Path, joints: list[dict], key: str) -> Side:
-    columns = []
-    for entry in joints:
-        lines = _field(path, entry, key, dict)
-        columns.append(
-            [_numbers(path, lines, name, 2) for name in _PAIRS] + [_numbers(path, lines, name) for name in _SINGLES]
-        )
-    fields: dict[str, Any] = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
-    fields |= {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
-    return Side(**fields)
-
-
-def _field(path: Path, table: dict, name: str, kind: type) -> Any:
-    value = table.get(name)
-    if type(value) is not kind:
-        raise CalibrationError(f"{path}: field {name!r} is missing or not a {kind.__name__}")
-    return value
-
-
-def _list_of(path: Path, table: dict, name: str, kind: type) -> list[Any]:
-    values = _field(path, table, name, list)
-    if any(type(value) is not kind for value in values):
-        raise CalibrationError(f"{path}: field {name!r} holds what is not a {kind.__name__}")
+def _row(table: dict[str, Any], name: str, count: int) -> np.ndarray:
+    values = np.atleast_1d(np.array(table[name], float))
+    if values.shape != (count,):
+        raise ValueError(f"{name!r} must hold {count} number(s)")
     return values
 
 
-def _numbers(path: Path, table: dict, name: str, count: int = 1) -> list[float]:
-    value = table.get(name)
-    values: list[Any] = value if isinstance(value, list) else [value]
-    if len(values) != count or any(type(v) not in (int, float) for v in values):
-        raise CalibrationError(f"{path}: field {name!r} must hold {count} number(s)")
-    try:
-        return [float(v) for v in values]
-    except OverflowError:
-        raise CalibrationError(f"{path}: field {name!r} holds a number without bounds") from None
+# --- what no hand gives -----------------------------------------------------------------------
 
 
-def _line(error: object) -> str:
-    return " ".join(str(error).split())[:100]
+@np.errstate(all="ignore")  # What overflows is out of its range.
+def check_plausible(where: object, calibration: Calibration, hand: Hand | None = None) -> None:
+    """Check every number that a run uses: a wrong torque from a file would drive the motors wrongly.
 
-
-def _text(value: str) -> str:
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-    return f'"{escaped}"'
-
-
-def _number(value: float | Array) -> str:
-    number = float(value)
-    return "nan" if math.isnan(number) else repr(number)
-
-
-def _list(values: Any) -> str:
-    return f"[{', '.join(_number(v) for v in np.asarray(values))}]"
-
-
-# --- what the numbers of a calibration file can be ------------------------------------------------
-#
-# The bounds are far from the values of a good hand: a wrong unit is found, an unusual hand is no error. Numbers that
-# are only reported need not be physical.
-
-_CURRENT = (0.03, 33.0)  # A, of a joint's full torque: a stalled XHand joint draws 1.5 A; 16 bits of mA end at 33 A
-# A a count: the wire counts mA, and runs limit the current by that. With another count, torques would not go with it.
-_PER_CURRENT = (0.99e-3, 1.01e-3)
-_TORQUE = (0.01, 20.0)  # Nm: finger motors stall at 0.4 and 1.1 Nm
-_LEVER = (1e-4, 0.3)  # Nm/N, fingertip about joint: a finger is 0.1 m long
-_FORCE = (1e-3, 100.0)  # N: the whole hand is rated for 80 N
-# N a count; the maker's is 0.1 N. Below 1 mN all 120 taxels, saturated at 255 counts, read 31 N together: less than the
-# 37 N of a motor of 1.1 Nm at a lever of 0.03 m. Above 1 N one saturated taxel reads three times what the hand gives.
-_PER_FORCE = (1e-3, 1.0)
-_PER_TORQUE = (1.0 / _LEVER[1], 1e3)  # N/Nm: a fingertip 0.3 m to 1 mm from its root joint's axis
-_REPORTED = 1e12  # magnitude of numbers that people read
-
-_REPORTS = ("gain_low", "gain_high", "offset_low", "offset_high", "noise", "r_squared", "condition", "friction")
-
-
-@np.errstate(all="ignore")  # What overflows is out of bounds.
-def check_numbers(path: object, calibration: Calibration, hand: Hand | None = None) -> None:
-    """Check all numbers of a calibration.
+    The ranges are far from the values of a good hand: a wrong unit is found, an unusual hand is no error.
 
     Args:
-      path: named in errors.
+      where: named in errors.
       calibration: its arrays have the right shapes.
       hand: the hand that it is of, if known.
 
     Raises:
-      CalibrationError: names the file, the joint or finger, the field, its value and the bound.
+      CalibrationError: names the joint or finger, the quantity, its value and its range.
     """
-    joints, scale = calibration.joint_names, np.asarray(calibration.torque_scale)
-    _range(path, (), "current_per_count", [calibration.current_per_count], _PER_CURRENT, "A")
-    _range(path, calibration.finger_names, "force_per_count", calibration.force_per_count, _PER_FORCE, "N")
-    if calibration.force_per_torque is not None:
-        force, (low, high) = np.asarray(calibration.force_per_torque), _PER_TORQUE
-        fits = (force == 0) | (force >= low) & (force <= high)
-        says = f"must be 0, or between {low:.3g} and {high:g} N/Nm"
-        _require(path, calibration.finger_names, "force_per_torque", force[0], fits[0], says)
-        _require(path, calibration.finger_names, "its interval", force[1:], np.abs(force[1:]) <= _REPORTED, "too large")
-    _range(path, joints, "torque_scale", scale, _TORQUE, "Nm")
-    if hand is not None:
-        same = np.abs(scale - hand.torque_limit) <= 0.01 * hand.torque_limit
-        _require(path, joints, "torque_scale", scale, same, "not the torque limit of the hand's model: calibrate again")
-    for key, side, most, unit in (
-        ("sim", calibration.sim, 3 * scale, "Nm"),
-        ("real", calibration.real, _CURRENT[1], "A"),
-    ):
-        _check_side(path, joints, key, side, np.broadcast_to(most, scale.shape), unit)
-    _range(path, joints, "sim.gain", calibration.sim.gain, _LEVER, "Nm/N", magnitude=True)
-    _check_torque(path, joints, calibration, scale)
-
-
-def _check_side(path: object, joints: tuple[str, ...], key: str, side: Side, most: np.ndarray, unit: str) -> None:
-    """Args:
-    most: [J], larger than what the joint can give.
-    """
-    gain = np.asarray(side.gain)
-    sound = np.isfinite(gain) & (gain != 0) & (np.sign(gain) == np.sign(gain[:1]))
-    _require(path, joints, f"{key}.gain", gain, sound, "must be finite, not 0, and of one sign in both directions")
-    _require(path, joints, f"{key}.offset", side.offset, np.isfinite(side.offset), "must be finite")
-    largest = np.asarray(side.value_max)
-    says = f"must be above 0 and at most {{:.3g}} {unit}"
-    _require(path, joints, f"{key}.value_max", largest, (largest > 0) & (largest <= most), says, most)
-    _range(path, joints, f"{key}.force_max", side.force_max, _FORCE, "N")
-    for name in (*_REPORTS, "samples", "outliers"):
-        value = np.asarray(getattr(side, name))
-        good = np.isnan(value) | (np.abs(value) <= _REPORTED)  # NaN: a direction was not recorded.
-        _require(path, joints, f"{key}.{name}", value, good, f"must be nan, or at most {_REPORTED:g}")
-
-
-def _check_torque(path: object, joints: tuple[str, ...], calibration: Calibration, scale: np.ndarray) -> None:
-    """What `joint_torque` makes of currents: neither the full torque for next to none, nor a torque without any.
-
-    It takes the middle of the simulation's two lines, and the hand's loading line, unloading line or their middle. That
-    one needs no check: its gain and offset are means of two of one sign, so its torques lie between theirs.
-    """
-    real, sim = calibration.real, calibration.sim
-    per_ampere = np.mean(sim.gain, 0) / np.asarray(real.gain)
-    full, (low, high) = scale / np.abs(per_ampere), _CURRENT
-    says = f"the full torque would need {{:.3g}} A, must be {low:g} to {high:g} A"
-    _require(path, joints, "real.gain", real.gain, (full >= low) & (full <= high), says, full)
-    unloaded = np.abs(np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)) / scale
-    says = "without current the joint would read {:.3g} of its full torque, must be below 1"
-    _require(path, joints, "real.offset", real.offset, unloaded < 1, says, unloaded)
-
-
-def _range(
-    path: object,
-    names: tuple[str, ...],
-    field: str,
-    values: Any,
-    bounds: tuple[float, float],
-    unit: str,
-    magnitude: bool = False,
-) -> None:
-    low, high = bounds
-    size = np.abs(values) if magnitude else np.asarray(values)
-    says = f"{'its magnitude ' if magnitude else ''}must be between {low:g} and {high:g} {unit}"
-    _require(path, names, field, values, (size >= low) & (size <= high), says)
-
-
-def _require(
-    path: object, names: tuple[str, ...], field: str, values: Any, good: np.ndarray, says: str, told: Any = None
-) -> None:
-    """Raise the error of the first value [..., K] of K joints or fingers that is not `good`; `says` may show `told`."""
-    if np.all(good):
-        return
-    place = tuple(int(i[0]) for i in np.nonzero(~good))
-    whose = f"{names[place[-1]]}: " if names else ""
-    number = "" if told is None else np.broadcast_to(told, good.shape)[place]
-    raise CalibrationError(f"{path}: {whose}{field} = {np.asarray(values)[place]:.6g}: {says.format(number)}")
+    joints, fingers = calibration.joint_names, calibration.finger_names
+    real, sim, scale = calibration.real, calibration.sim, np.asarray(calibration.torque_scale)
+    # `joint_torque` takes the middle of the simulation's lines, and the hand's loading line, unloading line or their
+    # middle. That one needs no check: its gain and offset are means of two of one sign.
+    per_ampere = np.mean(sim.gain, 0) / np.asarray(real.gain)  # [2, J] Nm/A
+    idle = np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)  # [2, J] Nm
+    force = np.zeros(0) if calibration.force_per_torque is None else np.asarray(calibration.force_per_torque)[0]
+    ranges: tuple[tuple[tuple[str, ...], str, Any, float, float, str], ...] = (
+        # The wire counts mA, and runs limit the current by that. With another count, torques would not go with it.
+        ((), "current_per_count", [calibration.current_per_count], 0.99e-3, 1.01e-3, "A"),
+        # The maker's is 0.1 N. Below 1 mN all 120 taxels, saturated at 255 counts, read 31 N together: less than the
+        # 37 N of 1.1 Nm at a lever of 0.03 m. Above 1 N one saturated taxel reads three times what the hand gives.
+        (fingers, "force_per_count", calibration.force_per_count, 1e-3, 1.0, "N"),
+        # A fingertip is 0.3 m to 1 mm from its root joint's axis; 0: not pressed.
+        (fingers, "force_per_torque", np.where(force == 0, 10.0, force), 1 / 0.3, 1e3, "N/Nm"),
+        (joints, "torque_scale", scale, 0.01, 20.0, "Nm"),  # finger motors stall at 0.4 and 1.1 Nm
+        (joints, "torque_scale over the hand's limit", scale / (hand.torque_limit if hand else scale), 0.99, 1.01, ""),
+        (joints, "magnitude of sim.gain", np.abs(sim.gain), 1e-4, 0.3, "Nm/N"),  # a finger is 0.1 m long
+        (joints, "sim.gain unloading over loading", sim.gain[1] / sim.gain[0], 1e-4, 1e4, ""),
+        (joints, "real.gain unloading over loading", real.gain[1] / real.gain[0], 1e-4, 1e4, ""),
+        # A stalled XHand joint draws 1.5 A; 16 bits of mA end at 33 A.
+        (joints, "current of the full torque by real.gain", scale / np.abs(per_ampere), 0.03, 33.0, "A"),
+        (joints, "share of the full torque without current by real.offset", np.abs(idle) / scale, 0.0, 1.0, ""),
+        (joints, "sim.force_max", sim.force_max, 1e-3, 100.0, "N"),  # the whole hand is rated for 80 N
+        (joints, "real.force_max", real.force_max, 1e-3, 100.0, "N"),
+        (joints, "sim.value_max", sim.value_max, 1e-6, 60.0, "Nm"),
+        (joints, "real.value_max", real.value_max, 1e-6, 33.0, "A"),
+    )
+    for names, quantity, values, low, high, unit in ranges:
+        values = np.asarray(values)
+        bad = np.argwhere(~((values >= low) & (values <= high)))  # also NaN
+        if len(bad):
+            name = f"{names[bad[0][-1]]}: " if names else ""
+            raise CalibrationError(
+                f"{where}: {name}{quantity} = {values[tuple(bad[0])]:.4g}: must be between {low:.4g} and {high:.4g} "
+                f"{unit}".rstrip()
+            )

@@ -13,6 +13,13 @@ from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 
+MARGIN = 0.05
+"""rad, kept from the joint's limits."""
+_PAUSE = 0.3  # s, standing still between the parts of the chirp
+_STEP = 0.4  # s at each step
+_SLOW = 0.5  # rad/s, of the slow triangle
+_REVERSAL, _REVERSAL_TIME = 0.02, 0.4  # rad, s: the small reversals
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Excitation(Config):
@@ -31,22 +38,10 @@ class Excitation(Config):
     chirp_parts: int = setting(6, unit="1", low=1, high=100)
     """Parts that the chirp is cut into, with a pause after each: where the joint rests, an
     identification can begin anew, and errors within a dead-band do not pile up."""
-    pause: float = setting(0.3, unit="s", low=0.0, high=10.0)
-    """Standing still between the parts of the chirp."""
     step_count: int = setting(6, unit="1", low=0, high=200)
     """Steps, of alternating sign and two sizes."""
-    step_hold: float = setting(0.4, unit="s", low=0.05, high=10.0)
-    """Time at each step."""
-    slow_cycles: int = setting(1, unit="1", low=0, high=50)
-    """Slow triangles."""
-    slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=5.0)
-    """Speed of the slow triangles."""
-    reversal_amplitude: float = setting(0.02, unit="rad", low=0.001, high=0.3)
-    """Of the small reversals."""
     reversal_cycles: int = setting(4, unit="1", low=0, high=200)
-    """Small reversals, once up and down in 0.4 s each."""
-    margin: float = setting(0.05, unit="rad", low=0.0, high=0.5)
-    """Kept from the joint's limits."""
+    """Small reversals, once up and down each."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -76,23 +71,23 @@ def triangles(cycles: int, cycle_seconds: float, period: float) -> np.ndarray:
 def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndarray:
     """Targets [T] rad of one joint about `middle`, no farther than `reach` from it."""
     size, period = min(config.amplitude, reach), config.period
-    small = min(config.reversal_amplitude, reach)
+    small = min(_REVERSAL, reach)
     rest = np.zeros(round(config.rest / period))
     ladder = np.linspace(*config.chirp_frequency, config.chirp_parts + 1)
     fading = np.linspace(1.0, 0.25, config.chirp_parts + 1)
     bursts = []
     for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
         wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
-        bursts += [size * strength * wave, np.zeros(round(config.pause / period))]
+        bursts += [size * strength * wave, np.zeros(round(_PAUSE / period))]
     parts = [
         rest,
         *bursts,
         rest,
-        size * steps(config.step_count, config.step_hold, period),
+        size * steps(config.step_count, _STEP, period),
         rest,
-        size * triangles(config.slow_cycles, 4 * size / config.slow_speed, period),
+        size * triangles(1, 4 * size / _SLOW, period),
         rest,
-        small * triangles(config.reversal_cycles, 0.4, period),
+        small * triangles(config.reversal_cycles, _REVERSAL_TIME, period),
         rest,
     ]
     return middle + np.concatenate(parts)
@@ -119,7 +114,7 @@ def excitation(
     if posture is None:
         posture = (hand.joint_lower + hand.joint_upper) / 2
     posture = np.asarray(posture, float)
-    low, high = hand.joint_lower + config.margin, hand.joint_upper - config.margin
+    low, high = hand.joint_lower + MARGIN, hand.joint_upper - MARGIN
     targets = {}
     for name in joints or hand.joint_names:
         if name not in hand.joint_names:

@@ -6,15 +6,16 @@ the jitted simulation; latency is a whole number and the dead-band a threshold, 
 searched outside of it (`dexsim.identification.search`).
 """
 
+import dataclasses
 from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import CalibrationError
-from dexsim.identification.joint import JointLog, segments, simulate, with_defaults
-from dexsim.identification.report import TYPICAL, Identification, advice, groups, uncertainty
-from dexsim.identification.search import BOUNDS, CHI2, Problem
+from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
+from dexsim.identification.search import CHI2, Search
+from dexsim.identification.uncertainty import groups, uncertainty
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -26,8 +27,66 @@ MODEL = (
 )
 """Note of every identification."""
 
+_GROUP = "the data do not separate or do not show {}: docs/calibration.md says what to record"
+
 FIT = ("stiffness", "damping", "coulomb_friction", "viscous_friction", "stall_torque")
 """What is fitted by default, apart from latency, dead-band and the angles where it rests."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Identification:
+    """Fitted parameters of one joint, and how far to trust them."""
+
+    joint: str
+    values: dict[str, float]
+    """Every parameter of the model, fitted or fixed."""
+    fitted: tuple[str, ...]
+    intervals: dict[str, tuple[float, float]]
+    """95 %, of the fitted ones; infinite where the data do not tell. For a joint that obeys this model at this time
+    step: noise and what differs from signal to signal are in it, another engine's steps are not."""
+    correlation: np.ndarray
+    """[P, P], in the order of `fitted`; NaN for what the data do not tell."""
+    condition: float
+    """Condition number of the Jacobian, each column for a relative change of its parameter."""
+    latency: int
+    """Sub-steps."""
+    latency_cost: dict[int, float]
+    """Sum of squares over that of the best, less one, at each latency tried."""
+    latency_plausible: tuple[int, ...]
+    """Latencies that the data do not exclude."""
+    timestep: float
+    """s, of a sub-step."""
+    unidentifiable: tuple[tuple[str, ...], ...]
+    """Groups of which only a combination is known; alone: no effect on these data, or next to
+    none."""
+    at_bound: tuple[str, ...]
+    rmse: float
+    """rad, of the angles fitted to."""
+    torque_rmse: float
+    """Nm; NaN without torques."""
+    holdout_rmse: float
+    """rad, on a log that was not fitted to; NaN without one."""
+    holdout_rmse_before: float
+    """rad, on the same log with the values that the search began with."""
+    notes: tuple[str, ...]
+
+    def report(self) -> str:
+        """A table for people."""
+        rows = [
+            f"{self.joint}: rmse {1e3 * self.rmse:.2f} mrad, hold-out "
+            f"{1e3 * self.holdout_rmse:.2f} mrad (before {1e3 * self.holdout_rmse_before:.2f})",
+            f"{'parameter':18}{'value':>12}{'95 % from':>12}{'to':>12}  unit",
+        ]
+        for name in self.fitted:
+            low, high = self.intervals[name]
+            mark = " at its bound" if name in self.at_bound else ""
+            rows.append(f"{name:18}{self.values[name]:12.5g}{low:12.5g}{high:12.5g}  {PARAMETERS[name].unit}{mark}")
+        others = ", ".join(str(lag) for lag in self.latency_plausible if lag != self.latency)
+        rows.append(
+            f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms"
+            + (f" (not excluded: {others})" if others else "")
+        )
+        return "\n".join(rows + [f"note: {note}" for note in self.notes])
 
 
 def identify(
@@ -38,50 +97,121 @@ def identify(
     substeps: int = 3,
     latencies: tuple[int, ...] = tuple(range(9)),
     dead_band: tuple[float, float] | None = (0.0, 0.03),
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    position_noise: float = 0.002,
-    torque_noise: float = 0.02,
     holdout: JointLog | None = None,
 ) -> Identification:
     """Fit one joint.
 
     Args:
       log: the recording; the joint rests at its beginning.
-      start: first guesses and fixed values, by name in `joint_model.PARAMETERS`.
+      start: first guesses and fixed values, by name in `joint.PARAMETERS`.
       fit: smooth parameters to fit; the start angles of the segments are always fitted.
       substeps: sub-steps of the simulation in a sample; period / substeps should be the time
         step that the parameters will be used with.
       latencies: candidates, sub-steps; one of them alone fixes it.
       dead_band: range to search, rad, or None to keep the value in `start`.
-      bounds: by name, in place of `BOUNDS`.
-      position_noise, torque_noise: rad, Nm: first weights; they are estimated from what the fit
-        leaves.
-      holdout: another recording, best with other signals, to test on.
+      holdout: another recording with the same period, best with other signals, to test on.
 
     Raises:
       CalibrationError: says what is wrong with the log or what to record.
     """
     for recording in (log,) if holdout is None else (log, holdout):
         check_log(recording)
-    if holdout is not None and not np.isclose(holdout.period, log.period):
-        raise CalibrationError(
-            f"{holdout.name}: a period of {holdout.period:g} s, that of the log to fit is {log.period:g} s: a latency "
-            "in sub-steps is not the same in both"
+    search = Search(log, start, fit, substeps, dead_band)
+    search.run(latencies)
+    latency, theta, count = search.latency, search.theta, search.count
+    fitted = search.names[:count]
+    residual = search.residual(theta, search.starts)
+    intervals, correlation, condition, unidentifiable = _intervals(search, residual)
+    values = {name: float(value) for name, value in search.fixed.items()}
+    first = dict(values)
+    values |= dict(zip(search.names, map(float, theta), strict=True))
+    values["start"] = float(search.starts[0])
+    margin = 1e-3 * _size(search)
+    at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
+    at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
+    # All from the solution and with the weights found last: costs under other weights cannot be compared.
+    cost = {}
+    for search.latency in sorted(latencies):
+        cost[search.latency] = search.solve(theta, 10)[0]
+    least = min(cost.values())
+    slack = CHI2 / max(residual.size - count, 1)
+    plausible = tuple(lag for lag in cost if cost[lag] <= least * (1 + slack))
+    before = after = float("nan")
+    if holdout is not None:
+        before, _ = evaluate(holdout, first, latency=latency, substeps=substeps)
+        after, _ = evaluate(holdout, values, latency=latency, substeps=substeps)
+    rmse = np.sqrt(np.mean((residual.reshape(search.measured.shape) * search.noise[:, None]) ** 2, -1))
+    notes = [MODEL, *(_GROUP.format(", ".join(group)) for group in unidentifiable)]
+    notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
+    notes += _notes(log, latency, latencies, plausible, before, after)
+    return Identification(
+        joint=log.name,
+        values=values,
+        fitted=fitted,
+        intervals=intervals,
+        correlation=correlation,
+        condition=condition,
+        latency=latency,
+        latency_cost={lag: cost[lag] / least - 1.0 for lag in cost},
+        latency_plausible=plausible,
+        timestep=search.timestep,
+        unidentifiable=unidentifiable,
+        at_bound=at_bound,
+        rmse=float(rmse[0]),
+        torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
+        holdout_rmse=after,
+        holdout_rmse_before=before,
+        notes=tuple(notes),
+    )
+
+
+def _size(search: Search) -> np.ndarray:
+    """What counts as a relative change of 1 of each fitted parameter."""
+    return np.maximum(np.abs(search.theta), search.typical)[: search.count]
+
+
+def _intervals(
+    search: Search, residual: np.ndarray
+) -> tuple[dict[str, tuple[float, float]], np.ndarray, float, tuple[tuple[str, ...], ...]]:
+    """Intervals and correlation [P, P] of the fitted parameters, condition number, and groups that are not separated.
+
+    From the curvature at the best point, widened by what was seen to fit as well farther off.
+    """
+    theta, count, size = search.theta[: search.count], search.count, _size(search)
+    jacobian = search.jacobian(search.theta, search.starts)
+    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
+    sizes = np.append(size, np.full(len(search.starts), 0.05))
+    half, correlation, condition, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
+    half, correlation = half[:count], correlation[:count, :count]
+    null = [members[:count] for members in null if np.any(members[:count])]
+    least, largest = search.plausible()
+    low = np.maximum(np.minimum(theta - half, least[:count]), search.low[:count])
+    high = np.minimum(np.maximum(theta + half, largest[:count]), search.high[:count])
+    if search.dead_band is not None:
+        first, last = search.dead_band_profile(search.dead_band)
+        low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
+    fitted = search.names[:count]
+    intervals = {name: (float(a), float(b)) for name, a, b in zip(fitted, low, high, strict=True)}
+    return intervals, correlation, condition, groups(fitted, null, correlation, half, size)
+
+
+def _notes(
+    log: JointLog, latency: int, latencies: tuple[int, ...], plausible: tuple[int, ...], before: float, after: float
+) -> list[str]:
+    notes = []
+    if len(latencies) > 1 and latency == max(latencies):
+        notes.append("latency is the largest that was tried: try more")
+    if latency not in plausible:
+        others = ", ".join(map(str, plausible))
+        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
+    speed = np.gradient(log.position)
+    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
+        notes.append("the joint went one way only: friction and offsets are not apart")
+    if np.isfinite(after) and after > 0.9 * before:
+        notes.append(
+            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
         )
-    limits = dict(BOUNDS) | {"dead_band": dead_band or (0.0, np.inf)}
-    if unknown := sorted({*(bounds or {})} - {*limits}):
-        raise CalibrationError(f"there are no bounds of {unknown[0]!r}: choose from {', '.join(limits)}")
-    if not latencies:
-        raise CalibrationError("no latencies to try: give at least one, in sub-steps")
-    limits |= dict(bounds or {})
-    problem = Problem(log, start, fit, substeps, limits, np.array([position_noise, torque_noise]))
-    latency = problem.best_latency(latencies)
-    for fine in (False, True):  # once with the given weights, once with those found
-        if dead_band is not None:
-            problem.search_dead_band(latency, dead_band, fine)
-        latency = problem.best_latency(latencies, latency)
-        problem.settle(latency, dead_band is not None, last=fine)
-    return _conclude(problem, latency, latencies, dead_band, holdout)
+    return notes
 
 
 def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> tuple[float, float]:
@@ -92,174 +222,45 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
     segment, angle = segments(log)
     full = with_defaults(dict(values), log)
     full["start"] = jnp.asarray(angle[segment], jnp.float32) - full["encoder_bias"]
-    readings = simulate(
-        full,
-        jnp.asarray(log.target, jnp.float32),
-        jnp.int32(latency),
-        jnp.float32(log.period / substeps),
-        substeps,
-        segment,
-    )
-    measured = (log.position, np.nan if log.torque is None else log.torque)
-    angle_off, torque_off = (
-        float(np.sqrt(np.mean((np.asarray(ours, float) - theirs) ** 2)))
-        for ours, theirs in zip(readings, measured, strict=True)
-    )
-    return angle_off, torque_off
+    timestep, target = jnp.float32(log.period / substeps), jnp.asarray(log.target, jnp.float32)
+    position, torque = simulate(full, target, jnp.int32(latency), timestep, substeps, segment)
+    measured = np.nan if log.torque is None else log.torque
+    angle_error, torque_error = np.asarray(position, float) - log.position, np.asarray(torque, float) - measured
+    return float(np.sqrt(np.mean(angle_error**2))), float(np.sqrt(np.mean(torque_error**2)))
 
 
 def check_log(log: JointLog) -> None:
     """Refuse a log that cannot tell.
 
     Raises:
-      CalibrationError: too short, not numbers, mixed units, no motion, saturated throughout.
+      CalibrationError: too short, not numbers, another unit, no motion, saturated throughout.
     """
-    channels = {"target": log.target, "position": log.position} | ({} if log.torque is None else {"torque": log.torque})
-    for name, values in channels.items():
-        if np.shape(values) != np.shape(log.target) or np.ndim(values) != 1:
-            raise CalibrationError(
-                f"{log.name}: {name} has shape {np.shape(values)}, target "
-                f"{np.shape(log.target)}: give arrays of one length"
-            )
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            raise CalibrationError(
-                f"{log.name}: {name} is not a number at sample {bad[0]}: cut "
-                "the log there, samples must follow each other without gaps"
-            )
-    if len(log.target) < MIN_SAMPLES:
+    channels = [log.target, log.position] + ([] if log.torque is None else [log.torque])
+    shapes = [np.shape(channel) for channel in channels]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 1 or shapes[0][0] < MIN_SAMPLES:
         raise CalibrationError(
-            f"{log.name}: {len(log.target)} samples: at least {MIN_SAMPLES} of "
-            "chirp, steps, slow triangles and small reversals are needed"
+            f"{log.name}: got {', '.join(map(str, shapes))}; expected arrays of one length, at least {MIN_SAMPLES} "
+            "samples of chirp, steps, slow triangles and small reversals"
+        )
+    if not np.all(np.isfinite(channels)):
+        raise CalibrationError(
+            f"{log.name}: a sample is not a number: cut the log there, samples must follow each other without gaps"
         )
     if not 1e-4 <= log.period <= 0.2:
         raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 to 0.2")
-    moved, asked = np.ptp(log.position), np.ptp(log.target)
-    if max(np.abs(log.position).max(), np.abs(log.target).max()) > 2 * np.pi:
+    largest = max(np.abs(log.position).max(), np.abs(log.target).max())
+    if largest > 2 * np.pi:
+        raise CalibrationError(f"{log.name}: angles of {largest:.3g}: give rad, not degrees or counts")
+    moved, commanded = np.ptp(log.position), np.ptp(log.target)
+    if min(moved, commanded) < MIN_MOTION or not 1 / 20 < moved / commanded < 20:
         raise CalibrationError(
-            f"{log.name}: angles of {np.abs(log.position).max():.3g}: give rad, not degrees or counts"
+            f"{log.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of "
+            "motion is needed, target and position in the same unit"
         )
-    if min(asked, moved) > 1e-3 and not 1 / 20 < moved / asked < 20:
+    size = np.zeros(1) if log.torque is None else np.abs(log.torque)
+    if size.max() > 50.0:
+        raise CalibrationError(f"{log.name}: torque of {size.max():.3g} Nm: give Nm")
+    if log.torque is not None and np.mean(size > 0.97 * size.max()) > 0.6:
         raise CalibrationError(
-            f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
-            "rad: target and position are in different units"
+            f"{log.name}: torque sits at {size.max():.3g} Nm in most samples: saturated, give smaller commands"
         )
-    if asked < MIN_MOTION or moved < MIN_MOTION:
-        raise CalibrationError(
-            f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
-            f"rad: at least {MIN_MOTION} rad of motion is needed"
-        )
-    if log.torque is not None:
-        size = np.abs(log.torque)
-        if size.max() > 50.0:
-            raise CalibrationError(f"{log.name}: torque of {size.max():.3g} Nm: give Nm")
-        if np.mean(size > 0.97 * size.max()) > 0.6:
-            raise CalibrationError(
-                f"{log.name}: torque sits at {size.max():.3g} Nm in most "
-                "samples: saturated, give smaller or slower commands"
-            )
-
-
-def _conclude(
-    problem: Problem,
-    latency: int,
-    latencies: tuple[int, ...],
-    dead_band: tuple[float, float] | None,
-    holdout: JointLog | None,
-) -> Identification:
-    log, theta = problem.log, problem.theta
-    fitted = problem.names if dead_band is not None else problem.names[:-1]
-    count = len(fitted)
-    residual = problem.residual(theta, problem.starts, latency)
-    jacobian = problem.jacobian(theta, problem.starts, latency)
-    columns = np.r_[np.arange(count), np.arange(len(theta), jacobian.shape[1])]
-    size = np.maximum(np.abs(theta), [TYPICAL[name] for name in problem.names])[:count]
-    half, correlation, condition, null = uncertainty(
-        jacobian[:, columns], residual, np.append(size, np.full(len(problem.starts), 0.05)), problem.segment
-    )
-    half, correlation = half[:count], correlation[:count, :count]
-    null = [members[:count] for members in null if np.any(members[:count])]
-    low, high = problem.low[:count], problem.high[:count]
-    # Curvature at the best point, widened by what was seen to fit as well farther off.
-    least, largest = problem.plausible(latency, dead_band is not None)
-    ends = np.stack(
-        [
-            np.maximum(np.minimum(theta[:count] - half, least[:count]), low),
-            np.minimum(np.maximum(theta[:count] + half, largest[:count]), high),
-        ],
-        -1,
-    )
-    intervals = {name: (float(a), float(b)) for name, (a, b) in zip(fitted, ends, strict=True)}
-    if dead_band is not None:
-        profile = problem.dead_band_profile(latency, dead_band)
-        linear = intervals["dead_band"]
-        intervals["dead_band"] = (min(profile[0], linear[0]), max(profile[1], linear[1]))
-    values = {name: float(value) for name, value in problem.fixed.items()}
-    values |= dict(zip(problem.names, map(float, theta), strict=True))
-    values["start"] = float(problem.starts[0])
-    touching = (theta[:count] <= low + 1e-3 * size) | (theta[:count] >= high - 1e-3 * size)
-    at_bound = tuple(n for n, hit in zip(fitted, touching, strict=True) if hit)
-    sets = groups(fitted, null, correlation, half, size)
-    errors = residual.reshape(len(problem.measured), -1) * problem.noise[: len(problem.measured), None]
-    rmse = np.sqrt(np.mean(errors**2, -1))
-    # All from the solution and with the weights found last: costs under other weights cannot be compared.
-    cost = {lag: problem.solve(theta, lag, 10)[0] for lag in latencies}
-    least_cost = min(cost.values())
-    slack = CHI2 / max(residual.size - count, 1)
-    plausible = tuple(lag for lag in sorted(cost) if cost[lag] <= least_cost * (1 + slack))
-    before = after = float("nan")
-    if holdout is not None:
-        first = {name: float(value) for name, value in problem.fixed.items()}
-        before = evaluate(holdout, first, latency=latency, substeps=problem.substeps)[0]
-        after = evaluate(holdout, values, latency=latency, substeps=problem.substeps)[0]
-    return Identification(
-        joint=log.name,
-        values=values,
-        fitted=fitted,
-        intervals=intervals,
-        correlation=correlation,
-        condition=condition,
-        latency=latency,
-        latency_cost={lag: cost[lag] / least_cost - 1.0 for lag in sorted(cost)},
-        latency_plausible=plausible,
-        timestep=problem.timestep,
-        unidentifiable=sets,
-        at_bound=at_bound,
-        rmse=float(rmse[0]),
-        torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
-        holdout_rmse=after,
-        holdout_rmse_before=before,
-        notes=tuple(_notes(log, latency, latencies, plausible, sets, at_bound, before, after)),
-    )
-
-
-def _notes(
-    log: JointLog,
-    latency: int,
-    latencies: tuple[int, ...],
-    plausible: tuple[int, ...],
-    sets: tuple[tuple[str, ...], ...],
-    at_bound: tuple[str, ...],
-    before: float,
-    after: float,
-) -> list[str]:
-    notes = advice(sets)
-    notes.append(MODEL)
-    notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
-    if len(latencies) > 1 and latency == max(latencies):
-        notes.append("latency is the largest that was tried: try more")
-    if latency not in plausible:
-        others = ", ".join(map(str, plausible))
-        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
-    speed = np.gradient(log.position)
-    if (
-        min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1
-        or np.all(np.diff(log.target) >= 0)
-        or np.all(np.diff(log.target) <= 0)
-    ):
-        notes.append("the joint went one way only: friction and offsets are not apart")
-    if np.isfinite(after) and after > 0.9 * before:
-        notes.append(
-            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
-        )
-    return notes

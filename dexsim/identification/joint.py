@@ -10,6 +10,8 @@ Integrated as the physics does, semi-implicit Euler at the physics' time step, w
 
 import dataclasses
 import functools
+import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -18,45 +20,35 @@ import numpy as np
 from dexsim.actuator.drive import Actuator, apply_friction, joint_torque, pd_torque, torque_limit
 from dexsim.core.errors import CalibrationError
 
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A parameter of the joint, in its unit."""
+
+    unit: str
+    typical: float  # size below which it hardly matters on this kind of hand; makes relative errors
+    low: float  # bounds of the search
+    high: float
+    nominal: float | None = None  # value where nobody gives one; None: it must be given
+
+
 PARAMETERS = {
-    "stiffness": "Nm/rad",
-    "damping": "Nm s/rad",
-    "dead_band": "rad",
-    "stall_torque": "Nm",
-    "no_load_speed": "rad/s",
-    "efficiency": "1",
-    "encoder_bias": "rad",
-    "coulomb_friction": "Nm",
-    "viscous_friction": "Nm s/rad",
-    "inertia": "kg m^2",
-    "gravity_cos": "Nm",
-    "gravity_sin": "Nm",
-    "start": "rad",
+    "stiffness": Parameter("Nm/rad", 1.0, 0.01, 100.0),
+    "damping": Parameter("Nm s/rad", 0.05, 0.0, 10.0),
+    "dead_band": Parameter("rad", 0.005, 0.0, math.inf, 0.0),
+    "stall_torque": Parameter("Nm", 0.4, 0.01, 10.0),
+    "no_load_speed": Parameter("rad/s", 10.0, 0.5, 100.0),
+    "efficiency": Parameter("1", 0.5, 0.2, 1.5, 1.0),
+    "encoder_bias": Parameter("rad", 0.01, -0.2, 0.2, 0.0),
+    "coulomb_friction": Parameter("Nm", 0.01, 0.0, 1.0, 0.0),
+    "viscous_friction": Parameter("Nm s/rad", 0.005, 0.0, 1.0, 0.0),
+    "inertia": Parameter("kg m^2", 1e-3, 1e-5, 0.1),
+    "gravity_cos": Parameter("Nm", 0.01, -1.0, 1.0, 0.0),
+    "gravity_sin": Parameter("Nm", 0.01, -1.0, 1.0, 0.0),
 }
-"""Parameters of the model with their units; `start` is the true angle at the first sample."""
+"""Parameters of the model. Beside them it has `start`, rad: the true angle at the first sample."""
 
-NOMINAL = {
-    "dead_band": 0.0,
-    "efficiency": 1.0,
-    "encoder_bias": 0.0,
-    "coulomb_friction": 0.0,
-    "viscous_friction": 0.0,
-    "gravity_cos": 0.0,
-    "gravity_sin": 0.0,
-}
-"""Values of parameters that nobody gave."""
-
-_DRIVE = (
-    "stiffness",
-    "damping",
-    "dead_band",
-    "stall_torque",
-    "no_load_speed",
-    "efficiency",
-    "encoder_bias",
-    "coulomb_friction",
-    "viscous_friction",
-)
+_JOINT = ("inertia", "gravity_cos", "gravity_sin")  # of the joint; the others are the drive's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +75,8 @@ def simulate(
     """Readings of the joint at each command.
 
     Args:
-      values: every name in `PARAMETERS`, scalars; `start` may be [T], that of each sample's
-        segment.
+      values: every name in `PARAMETERS`, scalars, and `start`, which may be [T], that of each
+        sample's segment.
       target: [T] rad, a new one every `substeps` sub-steps; at rest before the first.
       latency: [] int, sub-steps until a target acts.
       timestep: s, of a sub-step.
@@ -96,7 +88,7 @@ def simulate(
     Returns:
       Measured angle [T] rad (encoder bias included) and motor torque [T] Nm, before noise.
     """
-    drive = Actuator(**{name: values[name] for name in _DRIVE})
+    drive = Actuator(**{name: values[name] for name in PARAMETERS if name not in _JOINT})
     count = target.shape[0]
     index = jnp.arange(count * substeps) - latency
     acting = target[jnp.clip(index // substeps, 0)].reshape(count, substeps)
@@ -173,17 +165,17 @@ def _still(log: JointLog, first: int, limit: int) -> int:
     return int(np.argmin(np.append(same, False)))
 
 
-def with_defaults(values: dict[str, float], log: JointLog) -> dict[str, jax.Array]:
-    """All parameters, with nominal values for those left out.
+def with_defaults(values: Mapping[str, float], log: JointLog) -> dict[str, jax.Array]:
+    """All parameters and the start, with nominal values for those left out.
 
     Raises:
       CalibrationError: a name that is no parameter, or a missing parameter without a nominal value.
     """
-    unknown = sorted(set(values) - set(PARAMETERS))
-    if unknown:
-        raise CalibrationError(f"no parameter {unknown[0]!r}: choose from {', '.join(PARAMETERS)}")
-    full = NOMINAL | {"start": float(log.position[0]) - values.get("encoder_bias", 0.0)} | values
-    missing = [name for name in PARAMETERS if name not in full]
-    if missing:
+    full = {name: parameter.nominal for name, parameter in PARAMETERS.items()}
+    full["start"] = float(log.position[0]) - values.get("encoder_bias", 0.0)
+    if unknown := sorted(set(values) - set(full)):
+        raise CalibrationError(f"no parameter {unknown[0]!r}: choose from {', '.join(full)}")
+    full |= values
+    if missing := [name for name, value in full.items() if value is None]:
         raise CalibrationError(f"{log.name}: no value for {missing[0]}")
-    return {name: jnp.float32(full[name]) for name in PARAMETERS}
+    return {name: jnp.float32(value) for name, value in full.items()}

@@ -20,21 +20,20 @@ from dexsim.calibration.maps import save_calibration
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.bench import Workbench
-from dexsim_real.calibrate.gauge import Gauge
-from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.person import Gauge, Operator
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import fit
-from dexsim_real.calibrate.press_procedure import PressProcedure
-from dexsim_real.calibrate.read import read_logs
-from dexsim_real.calibrate.report import force_table, grouped, report, table
+from dexsim_real.calibrate.procedure import PressProcedure
+from dexsim_real.calibrate.read import read_presses
+from dexsim_real.calibrate.report import force_table, grouped, table
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
 
-_SPEED = 2.0  # rad/s, largest rate of change of the commands
+_SPEED = 2.0  # rad/s, largest rate of change of the commands: no motion here needs to be fast
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
@@ -45,15 +44,14 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     """
     plan = placements(hand, arguments.fingers, arguments.sides)
     gauge = Gauge(arguments.gauge, operator) if arguments.gauge else None
-    # No motion here needs to be fast.
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
     arguments = dataclasses.replace(arguments, safety=slow)
-    with stopping(), Workbench(arguments, hand, operator, {"task": "calibrate"}, **bench) as work:
-        procedure = PressProcedure(work.loop, arguments, operator, gauge)
+    with stopping(), Bench(arguments, hand, operator, "calibrate", **bench) as work:
+        procedure = PressProcedure(work, gauge)
         pressed = 0
         try:
-            procedure.check(tuple(placement.finger for placement in plan))
-            work.loop.await_motors()
+            procedure.check()
+            work.await_motors()
             for placement in plan:
                 pressed += procedure.press(placement)
         except HandError as error:
@@ -62,8 +60,8 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             raise HandError(
                 f"{error} (the {pressed} presses before are in {work.log.path}; fit them with --from-log)"
             ) from None
-        finally:  # A signal that comes just before this line is followed by the close of the workbench.
-            work.loop.close()
+        finally:  # A signal that comes just before this line is followed by the close of the bench.
+            work.close()
     return work.log.path
 
 
@@ -73,20 +71,18 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     Raises:
       DexsimError: the recordings are insufficient, or a file cannot be written.
     """
-    result = fit(read_logs(logs, hand), hand)
+    result = fit(read_presses(logs, hand), hand)
     operator.console.print(table(result))
     operator.console.print(force_table(result.calibration))
     for note in grouped(result.calibration.notes):
         operator.tell(f"note: {note}")
-    for option, path in (("--output", arguments.destination), ("--report", arguments.report)):
-        if path and path.exists() and not arguments.force:  # It may have been created meanwhile.
-            raise HandError(
-                f"{path} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another {option}"
-            )
-    save_calibration(arguments.destination, result.calibration)
-    operator.tell(f"calibration: {arguments.destination}")
-    if arguments.report:
-        cli.write_json(arguments.report, report(result))
+    output = arguments.destination
+    if output.exists() and not arguments.force:  # It may have been created meanwhile.
+        raise HandError(
+            f"{output} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another"
+        )
+    save_calibration(output, result.calibration)
+    operator.tell(f"calibration: {output}")
     if arguments.plot:
         plot_calibration(arguments.plot, result.calibration, result.real, result.sim)
         operator.tell(f"figure: {arguments.plot}")
@@ -100,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.calibrate",
         description=__doc__.splitlines()[0],
     )
-    for path in (arguments.destination, arguments.report, arguments.plot):
+    for path in (arguments.destination, arguments.plot):
         if path:
             cli.check_writable(path)
     prepare_jax()

@@ -1,4 +1,4 @@
-"""A hand on the bench: port, log and safety limits of a procedure, opened and closed together."""
+"""A hand on the bench: the exchange loop of a procedure that moves and measures, with its log and safety limits."""
 
 import sys
 import time
@@ -6,31 +6,42 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.hand_loop import HandLoop, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.person import Operator
 from dexsim_real.control.motors_off import UNCONFIRMED
-from dexsim_real.control.safety import Safety
+from dexsim_real.control.policy_loop import smooth
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
+from dexsim_real.loop import Exchange, ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Command, Frame
 from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.link import HandPort, greet
 from dexsim_real.wire.serial_hand import open_port
 
+_PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 
-class Workbench:
-    """A hand with log and safety limits for one procedure. A context manager that ends with the motors off.
+
+class Bench(ExchangeLoop):
+    """The exchange loop, one `step` per cycle. A context manager that ends with the motors off.
+
+    In a run a thread keeps the delays of a policy away from the hand. A procedure has no such delays, so one call makes
+    an exchange and returns its result. The taxels' zeros stay as they were tared: what they read is measured.
 
     Args:
       arguments: options of the command.
       hand: model of the hand.
       operator: is told what happens.
-      meta: written to the log, with the configuration.
+      task: "calibrate" or "identify", written to the log with the configuration.
       port: replaces the port that the arguments name.
       clock, sleep: replace those of `time`, for simulated time.
     """
@@ -40,52 +51,49 @@ class Workbench:
         arguments: CalibrateArguments,
         hand: Hand,
         operator: Operator,
-        meta: dict[str, Any],
+        task: str,
         *,
         port: HandPort | None = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        self._operator, self._meta = operator, meta
-        self._arguments = arguments
+        self.arguments, self.operator, self._task = arguments, operator, task
         sensing = HandSensing(hand, arguments.hardware)
-        path = arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log")
         if port is None:
             assert arguments.port is not None, "`CalibrateArguments` asks for it"
             port = open_port(arguments.port, arguments.link)
-        self.log = LogWriter(path)
-        self.safety = Safety(hand, arguments.safety, self._react)
-        self.loop = HandLoop(port, sensing, self.safety, self.log, arguments.rate, clock=clock, sleep=sleep)
+        self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log"))
+        safety = Safety(hand, arguments.safety, self._react)
+        super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, clock=clock, sleep=sleep)
+        self._recording = False
+        self._failing_since: float | None = None
+        self._connection: int | None = None
+        self._number = 0
 
-    def __enter__(self) -> "Workbench":
+    def __enter__(self) -> "Bench":
+        arguments = self.arguments
         try:
             # Only during the procedure: long computations in a real-time thread would starve the machine.
-            if self._arguments.realtime:
+            if arguments.realtime:
                 use_realtime()
-            for line in greet(self.loop.port):
+            for line in greet(self.port):
                 self._say(line)
-            identity, calibration = getattr(self.loop.port, "identity", None), self._arguments.calibration
-            known = load_calibration(calibration, self.loop.sensing.hand) if calibration else None
-            for note in check_identity(identity, self.loop.sensing.hand, known):
-                self._say(note)
-            self.log.add(
-                Kind.META,
-                {
-                    "env_config": {},
-                    "policy": "",
-                    "calibration": "",
-                    "serial": identity.serial_number if identity else "",
-                    "handedness": identity.handedness if identity else "",
-                    "hardware": to_dict(self._arguments.hardware),
-                    "safety": to_dict(self._arguments.safety),
-                    "check": to_dict(self._arguments.check),
-                    "press": to_dict(self._arguments.press),
-                    "rate": self._arguments.rate,
-                    "clock": time.time(),
-                    "environment": cli.environment_report(),
-                    **self._meta,
-                },
-            )
+            identity = getattr(self.port, "identity", None)
+            calibration = load_calibration(arguments.calibration, self.sensing.hand) if arguments.calibration else None
+            for line in check_identity(identity, self.sensing.hand, calibration):
+                self._say(line)
+            meta = {
+                "task": self._task,
+                "serial": identity.serial_number if identity else "",
+                "handedness": identity.handedness if identity else "",
+                "hardware": to_dict(arguments.hardware),
+                "safety": to_dict(arguments.safety),
+                "press": to_dict(arguments.press),
+                "rate": arguments.rate,
+                "clock": time.time(),
+                "environment": cli.environment_report(),
+            }
+            self.log.add(Kind.META, meta)
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise
@@ -93,26 +101,128 @@ class Workbench:
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         try:
-            self.loop.close()
+            self.close()
         finally:
             end = "" if error is None else str(error) or kind.__name__
-            if self.loop.driven:
+            if self.driven:
                 self._say(f"{UNCONFIRMED}: press the emergency stop")
             self.log.add(Kind.NOTE, f"end: {end or 'done'}")
             self.log.add(Kind.END, {"end": end})
             self.log.close()
-            if self._arguments.realtime:
+            if self.arguments.realtime:
                 leave_realtime()
-        if error is None and self.loop.driven:
+        if error is None and self.driven:
             raise HandError(f"{UNCONFIRMED}: press the emergency stop")
         if error is None and (self.log.dropped or self.log.failure):
             raise HandError(f"{self.log.dropped} log records are lost ({self.log.failure or 'the disk is too slow'})")
 
+    def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> Exchange | None:
+        """Make an exchange; None when it was not answered, or the measurement was implausible.
+
+        Args:
+          target: [J] rad, requested joint targets; None keeps the last ones.
+          mark: the exchange is logged; once it is answered, with this annotation.
+
+        Raises:
+          HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
+        """
+        now = self.clock()
+        if target is not None:
+            self.safety.set_target(target, now)
+        self._recording = mark is not None
+        decision, command = self.request()
+        self._number += 1
+        self._record(Kind.SENT, command, now)
+        exchange = self.take(decision, self.port.exchange(command))
+        if exchange is not None:
+            self._record(Kind.RECEIVED, exchange.state, exchange.sample.time)
+        self._check(now, exchange)
+        self.pace.wait()
+        if exchange is None or not exchange.plausible:
+            return None
+        if mark:
+            self.annotate(mark)
+        return exchange
+
+    def annotate(self, content: dict[str, Any]) -> None:
+        """Annotate the newest exchange in the log."""
+        self.log.add(Kind.TICK, {"sequence": self._number, **content}, self.clock())
+
+    def collect(
+        self, seconds: float, target: np.ndarray | None = None, mark: dict[str, Any] | None = None
+    ) -> list[Exchange]:
+        """The answered exchanges of this duration in s; `target` and `mark` as for `step`.
+
+        Raises:
+          HandError: see `step`; or none was answered.
+        """
+        until, exchanges = self.clock() + seconds, []
+        while self.clock() < until:
+            exchanges.append(self.step(target, mark))
+        answered = [exchange for exchange in exchanges if exchange is not None]
+        if not answered:
+            raise HandError(f"no usable answer in {seconds:g} s; check the cable")
+        return answered
+
+    def set_zero(self, exchanges: list[Exchange]) -> None:
+        """Tare the taxels with exchanges of an untouched hand.
+
+        Raises:
+          HandError: something touches a fingertip, or a taxel is stuck.
+        """
+        if stuck := self.sensing.set_tare([exchange.state for exchange in exchanges]):
+            raise HandError(f"{'; '.join(stuck)}; power-cycle the hand")
+        self.log.add(Kind.META, {"tare": self.sensing.tare})
+        self.step()  # What `Safety` has seen so far was not tared.
+
+    def await_motors(self) -> None:
+        """Turn the motors on, and wait until they are.
+
+        Raises:
+          HandError: see `step`.
+        """
+        self.engage()
+        while not self.safety.anchor:
+            self.step()
+
+    def move(self, goal: np.ndarray, speed: float = 0.6) -> None:
+        """Move to a posture [J] rad; the joint with the longest path has a mean speed of `speed` rad/s."""
+        start = self.safety.commanded  # Not the last reading, which may be wrong.
+        seconds = max(float(np.abs(goal - start).max()) / speed, 0.3)
+        begin = self.clock()
+        while (share := (self.clock() - begin) / seconds) < 1.0:
+            self.step(smooth(start, goal, share))
+        self.step(goal)
+
+    def _record(self, kind: Kind, block: np.ndarray, when: float) -> None:
+        """Log a frame as it is on the wire of a hand with id 0."""
+        if self._recording:
+            ends = frames.HOST, frames.palm_address(0)
+            source, target = ends if kind == Kind.SENT else ends[::-1]
+            frame = Frame(source, target, Command.EXCHANGE, block.tobytes())
+            self.log.add(kind, (self._number, frame.encode()), when)
+
+    def _check(self, now: float, exchange: Exchange | None) -> None:
+        safety = self.safety
+        if safety.latched:
+            raise HandError(f"stopped: {safety.latched}")
+        if self.log.failure:
+            raise HandError(f"stopped: the log is lost ({self.log.failure})")
+        if exchange is not None and self._connection not in (None, exchange.sample.generation):
+            raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
+        self._connection = exchange.sample.generation if exchange is not None else self._connection
+        reaction, reason = safety.last
+        working = exchange is not None and (reaction <= Reaction.CLIP or not safety.engaged)
+        self._failing_since = None if working else self._failing_since or now
+        if self._failing_since is not None and now - self._failing_since > _PATIENCE:
+            why = safety.refused or reason or "the hand does not answer"
+            raise HandError(f"stopped: {why} for {_PATIENCE:g} s")
+
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
         if text.startswith(("hold", "relax")) and self.safety.engaged:
-            self._operator.tell(f"  {text}")
+            self.operator.tell(f"  {text}")
 
     def _say(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
-        self._operator.tell(text)
+        self.operator.tell(text)

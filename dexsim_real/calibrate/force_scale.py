@@ -1,4 +1,4 @@
-"""Scale of the force: newtons per taxel count by the gauge, and how far it may be off."""
+"""Scale of the force: newtons per taxel count by the gauge, how far it may be off, and taxels that read nothing."""
 
 import dataclasses
 import functools
@@ -9,13 +9,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from dexsim.calibration.sensor import FingerFit, TaxelPress, fit_finger
-from dexsim.core.errors import CalibrationError, DexsimError
+from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 from dexsim_real.calibrate.read import PressSession, Recording
-from dexsim_real.calibrate.taxel_check import dead_taxels, fill_dead
+from dexsim_real.sensors.taxels import around
 
-ACTIVE = 2.0
-"""Counts above which a taxel takes part."""
+_ACTIVE = 2.0  # counts above which a taxel takes part
+_NEIGHBOURS = 3.0  # counts, mean of a taxel's neighbours above which it must read something
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
 _GAUGE = 0.015  # of the gauge itself, and of how straight it stands under the press
@@ -31,7 +31,7 @@ class ForceScale:
     per_count: np.ndarray  # [F] N, for a run
     newtons: dict[str, tuple[float, float]]  # by press: gain and offset, newtons = gain * counts + offset
     error: dict[str, float]  # by press: share of the gain, 95 %
-    sensors: dict[str, FingerFit]  # by finger with gauge readings: counts as in a run against newtons
+    gauged: bool  # whether a finger had gauge readings
     notes: tuple[str, ...]
 
 
@@ -41,49 +41,44 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
     Raises:
       CalibrationError: the readings do not rise with the force.
     """
-    nominal = session.hardware.force_per_count
-    newtons, error, fits, notes = {}, {}, dict[str, FingerFit](), list[str]()
-    for recording in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
-        levels = [level for level in recording.gauge if len(recording.samples(level))]
+    own: dict[int, float] = {}  # by finger: N per count as a run reads them
+    newtons, error, notes = {}, {}, []
+    for press in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
+        levels = {level: press.samples(level) for level in press.gauge if len(press.samples(level))}
         if len(levels) < _READINGS:
             if levels:
-                notes.append(f"{recording.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
+                notes.append(f"{press.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        every, readings = np.array(recording.counts), np.array(recording.shown)
-        counts = np.array([every[recording.samples(level)].mean(0) for level in levels])
-        active = binary_dilation((counts.max(0) >= ACTIVE).reshape(hand.taxel_grid), np.ones((3, 3))).ravel()
-        counts = counts * active
-        # The fit applies this gain to sums with the dead taxels filled in.
-        counts = fill_dead(hand, counts, dead_taxels(hand, counts, session.check.neighbours))
-        posture = [np.array(recording.position)[recording.samples(level)].mean(0) for level in levels]
-        gauge = np.array([recording.gauge[level] for level in levels])
-        gauge = gauge / upright(hand, recording.finger, counts, np.array(posture))
-        run = np.array([readings[recording.samples(level)].mean() for level in levels])
-        whole, sensor_fit = (_against(gauge, part, recording.name) for part in (counts.sum(-1), run))
-        newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
-        share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
-        error[recording.name] = float(np.hypot(share, _GAUGE))
-        sensor_fit = dataclasses.replace(sensor_fit, gain=sensor_fit.gain.widened(float(np.hypot(_GAUGE, _PLACE))))
-        notes.append(
-            f"{recording.name}: {sensor_fit.gain} counts per newton by the gauge ({sensor_fit.samples} readings), "
-            f"{sensor_fit.offset} counts at zero force"
+        counts, shown, posture = (
+            np.array([np.array(values)[rows].mean(0) for rows in levels.values()])
+            for values in (press.counts, press.shown, press.position)
         )
-        fits.setdefault(hand.finger_names[recording.finger], sensor_fit)
-    own = {name: 1.0 / sensor_fit.gain.value for name, sensor_fit in fits.items()}
-    others = float(np.mean(list(own.values()))) if own else nominal
-    per_count = np.array([own.get(name, others) for name in hand.finger_names])
-    notes += [
-        f"{name}: not compared with the gauge; has the mean of the other fingers (up to {100 * _OTHERS:.0f} % off)"
-        for name in hand.finger_names
-        if own and name not in own
-    ]
+        counts = counts * active_taxels(counts, hand.taxel_grid)
+        # The fit applies this gain to sums with the dead taxels filled in.
+        counts = fill_dead(hand, counts, dead_taxels(hand, counts))
+        gauge = np.array([press.gauge[level] for level in levels]) / upright(hand, press.finger, counts, posture)
+        whole, in_run = (_against(gauge, part, press.name) for part in (counts.sum(-1), shown))
+        newtons[press.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
+        share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
+        error[press.name] = float(np.hypot(share, _GAUGE))
+        notes.append(
+            f"{press.name}: {in_run.gain.widened(float(np.hypot(_GAUGE, _PLACE)))} counts per newton by the gauge "
+            f"({in_run.samples} readings), {in_run.offset} counts at zero force"
+        )
+        own.setdefault(press.finger, 1.0 / in_run.gain.value)
+    others = float(np.mean(list(own.values()))) if own else session.source.hardware.force_per_count
+    per_count = np.array([own.get(finger, others) for finger in range(hand.num_fingers)])
     if not own:
         notes.append(f"no gauge: the taxels' scale is the nominal one, which may be {100 * _NOMINAL:.0f} % off")
-    for recording in pressed:
-        finger = hand.finger_names[recording.finger]
-        newtons.setdefault(recording.name, (float(per_count[recording.finger]), 0.0))
-        error.setdefault(recording.name, _PLACE if finger in own else _OTHERS if own else _NOMINAL)
-    return ForceScale(per_count, newtons, error, fits, tuple(notes))
+    for finger, name in enumerate(hand.finger_names):
+        if own and finger not in own:
+            notes.append(
+                f"{name}: not compared with the gauge; has the mean of the others (up to {100 * _OTHERS:.0f} % off)"
+            )
+    for press in pressed:
+        newtons.setdefault(press.name, (float(per_count[press.finger]), 0.0))
+        error.setdefault(press.name, _PLACE if press.finger in own else _OTHERS if own else _NOMINAL)
+    return ForceScale(per_count, newtons, error, bool(own), tuple(notes))
 
 
 def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -93,7 +88,7 @@ def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -
     none their sum has any sign and direction: the share is then 1.
     """
     sums = counts.sum(-1)
-    active = sums >= ACTIVE
+    active = sums >= _ACTIVE
     if not active.any():
         return np.ones(len(counts))
     normals = [_normals(hand, jnp.int32(finger), jnp.asarray(q, jnp.float32)) for q in position]
@@ -111,5 +106,28 @@ def _normals(hand: Hand, finger: jax.Array, position: jax.Array) -> jax.Array:
 def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:
     try:
         return fit_finger(TaxelPress(gauge, np.maximum(counts, 0.0)[:, None]))
-    except DexsimError as error:
+    except CalibrationError as error:
         raise CalibrationError(f"{name}, gauge: {error}") from None
+
+
+def active_taxels(counts: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Mask [N] of the taxels that take part in counts [T, N] of a press, and of those beside them."""
+    active = (counts.max(0) >= _ACTIVE).reshape(grid)
+    return binary_dilation(active, np.ones((3, 3))).ravel()
+
+
+def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
+    """Mask [N] of taxels that read nothing in counts [T, N] of a press, although their neighbours did."""
+    largest = counts.max(0)
+    beside = np.where(around(hand, np.ones((1, hand.num_taxels))) > 0, around(hand, largest[None]), np.nan)[:, 0]
+    # At least half of the neighbours must read, so that taxels at the edge of a press do not count as dead.
+    pressed = (np.nanmean(beside, 0) >= _NEIGHBOURS) & (np.nanmedian(beside, 0) > 0.25 * _NEIGHBOURS)
+    return (largest <= 0) & pressed
+
+
+def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
+    """Counts [T, N] in which a dead taxel has the mean of its working neighbours."""
+    working = (~dead).astype(float)
+    near = around(hand, working[None])[:, 0]  # [8, N]
+    mean = np.sum(around(hand, counts * working), 0) / np.maximum(near.sum(0), 1)
+    return np.where(dead, mean, counts)

@@ -16,8 +16,9 @@ from dexsim.calibration.press import lever_arms
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
-_OPEN, _OPEN_THUMB = 0.1, (0.1, 0.1, 0.1)  # rad, of the joints that do not press
+_OPEN = 0.1  # rad, of the joints that do not press
 _SHARE = 0.3  # of the longest lever arm, above which a joint takes part
+_SIDES = {0: "palm's normal", 1: "thumb"}  # fingers with a joint that spreads them, and where that side faces
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Placement:
 
 
 def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
-    """All presses, pads first.
+    """All presses, pads first and the thumb's last of them.
 
     Args:
       hand: model of the hand.
@@ -44,39 +45,38 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     Raises:
       HandError: no such finger.
     """
-    for name in fingers:
-        if name not in hand.finger_names:
-            raise HandError(f"no finger {name!r}; choose from {', '.join(hand.finger_names)}")
+    if unknown := sorted(set(fingers) - set(hand.finger_names)):
+        raise HandError(f"no finger {unknown[0]!r}; choose from {', '.join(hand.finger_names)}")
     selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
     columns, rows = hand.taxel_grid
     middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
     side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
     plan = []
-    for finger in [*[i for i in selected if i], *[i for i in selected if not i]]:
-        name = hand.finger_names[finger]
-        plan.append(
-            _placement(
-                hand,
-                f"{name} pad",
-                finger,
-                middle,
-                _bent(hand, finger),
-                f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it",
-            )
-        )
-    for finger in [i for i in selected if sides and i in (0, 1)]:
-        name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
-        plan.append(
-            _placement(
-                hand,
-                f"{name} side",
-                finger,
-                side,
-                _spread(hand, finger),
-                f"hold the pen across the side of the {name} that faces the {toward}, 3 mm in front of it",
-            )
-        )
+    for finger in sorted(selected, key=lambda i: i == 0):
+        name, posture = hand.finger_names[finger], _opened(hand)
+        # Bent a little more than the others.
+        if finger == 0:
+            posture[:3] = 0.3, 0.3, 0.2
+        else:
+            first = int(hand.root_joint[finger])
+            posture[first : first + 2] = 0.35, 0.2
+        task = f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it"
+        plan.append(_placement(hand, f"{name} pad", finger, middle, posture, task))
+    for finger in [i for i in selected if sides and i in _SIDES]:
+        name, posture = hand.finger_names[finger], _opened(hand)
+        if finger == 0:
+            posture[0] = 0.4
+        else:
+            posture[3:6] = -0.1, 0.35, 0.1
+        task = f"hold the pen across the side of the {name} that faces the {_SIDES[finger]}, 3 mm in front of it"
+        plan.append(_placement(hand, f"{name} side", finger, side, posture, task))
     return plan
+
+
+def _opened(hand: Hand) -> np.ndarray:
+    posture = np.full(hand.num_joints, _OPEN)
+    posture[3] = 0.0
+    return np.clip(posture, hand.joint_lower, hand.joint_upper)
 
 
 def _placement(hand: Hand, name: str, finger: int, taxels: list[int], posture: np.ndarray, task: str) -> Placement:
@@ -85,32 +85,4 @@ def _placement(hand: Hand, name: str, finger: int, taxels: list[int], posture: n
     joints = np.flatnonzero(np.abs(arms) > _SHARE * longest)
     direction = np.zeros(hand.num_joints)
     direction[joints] = arms[joints] / longest
-    return Placement(name, finger, tuple(taxels), tuple(int(j) for j in joints), posture, direction, task)
-
-
-def _opened(hand: Hand) -> np.ndarray:
-    posture = np.full(hand.num_joints, _OPEN)
-    posture[:3] = _OPEN_THUMB
-    posture[3] = 0.0
-    return np.clip(posture, hand.joint_lower, hand.joint_upper)
-
-
-def _bent(hand: Hand, finger: int) -> np.ndarray:
-    """A posture in which the pressing finger is bent a little more than the others."""
-    posture = _opened(hand)
-    if finger == 0:
-        posture[:3] = 0.3, 0.3, 0.2
-    else:
-        first = int(hand.root_joint[finger])
-        posture[first : first + 2] = 0.35, 0.2
-    return posture
-
-
-def _spread(hand: Hand, finger: int) -> np.ndarray:
-    posture = _opened(hand)
-    if finger == 0:
-        posture[0] = 0.4
-    else:
-        posture[3] = -0.1
-        posture[4:6] = 0.35, 0.1
-    return posture
+    return Placement(name, finger, tuple(taxels), tuple(joints.tolist()), posture, direction, task)

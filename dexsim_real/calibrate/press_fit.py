@@ -14,24 +14,22 @@ lever arm, and of the motors' temperature.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import MIN_SAMPLES, JointPress
-from dexsim.calibration.maps import Calibration
+from dexsim.calibration.joint import MIN_SAMPLES, JointPress, fit_joint
+from dexsim.calibration.maps import Calibration, joint_torque
 from dexsim.calibration.press import MIN_LEVER
-from dexsim.calibration.sensor import FingerFit
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
-from dexsim_real.calibrate.force_per_torque import fit_force_per_torque
-from dexsim_real.calibrate.force_scale import ACTIVE, force_scale
-from dexsim_real.calibrate.press_procedure import LOADING, RELEASED, UNLOADING
+from dexsim_real.calibrate.force_scale import active_taxels, dead_taxels, fill_dead, force_scale
+from dexsim_real.calibrate.procedure import LOADING, RELEASED, TOUCHED, UNLOADING
 from dexsim_real.calibrate.read import PressSession, Recording
-from dexsim_real.calibrate.taxel_check import dead_taxels, fill_dead, taxel_names
+from dexsim_real.sensors.taxels import taxel_names
 
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
 _LEVER = 0.002  # m, 95 %, between the contact and the centre of the taxels' forces
@@ -41,7 +39,6 @@ _NOISE = 4.0  # standard deviations of the speed noise below which a joint is at
 _TOP, _TOP_BLOCKS = 0.97, 4  # a current in this share of its maximum for this many blocks is at the motor's limit
 _SHEAR = 0.1  # share of the force above which shear is noted
 _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
-
 
 METHOD = (
     f"the intervals contain the method's own error: {1e3 * _LEVER:g} mm of lever arm and {100 * _HEAT:g} % for warm "
@@ -66,13 +63,12 @@ class Blocks:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """A calibration, the data that it was fitted to, and the comparison of the taxels with the gauge."""
+    """A calibration, and the data that it was fitted to."""
 
     calibration: Calibration
     real: dict[str, JointPress]
     sim: dict[str, JointPress]
     source: dict[str, str]  # press that each joint was fitted to
-    sensors: dict[str, FingerFit]  # by finger: counts as in a run against newtons
 
 
 def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
@@ -86,23 +82,30 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     Raises:
       CalibrationError: recordings are missing or unusable.
     """
-    pressed = [r for r in session.recordings.values() if len(r.samples(LOADING, UNLOADING))]
-    if not pressed:
-        raise CalibrationError("no press was recorded; record again")
-    pressed_blocks, faint = _felt(pressed, hand.taxel_grid)
-    scale = force_scale(session, hand, [recording for recording, _ in pressed_blocks])
-    notes = [*scale.notes, *faint]
-    real, sim, source = {}, {}, {}
+    blocks, notes = {}, list[str]()
+    for name, recording in session.recordings.items():
+        if len(recording.samples(LOADING, UNLOADING)):
+            blocks[name] = make_blocks(recording, hand.taxel_grid)
+            if blocks[name].counts.sum() <= 0:  # Without force no lever arm.
+                del blocks[name]
+                notes.append(
+                    f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current"
+                )
+    if not blocks:
+        raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
+    scale = force_scale(session, hand, [session.recordings[name] for name in blocks])
+    real, sim, source = dict[str, JointPress](), dict[str, JointPress](), dict[str, str]()
     reach: dict[str, float] = {}
-    for recording, blocks in pressed_blocks:
-        dead = dead_taxels(hand, blocks.counts, session.check.neighbours)
-        blocks = dataclasses.replace(blocks, counts=fill_dead(hand, blocks.counts, dead))
-        gain, offset = scale.newtons[recording.name]
-        force = blocks.counts.sum(-1) * gain + offset
-        torque = taxel_torque(hand, blocks.position, recording.finger, blocks.counts * gain)
+    for name, part in blocks.items():
+        recording, (gain, offset) = session.recordings[name], scale.newtons[name]
+        dead = dead_taxels(hand, part.counts)
+        counts = fill_dead(hand, part.counts, dead)
+        force = counts.sum(-1) * gain + offset
+        torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
         high = force > 0.5 * force.max()
         lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
-        slip = _shear_share(blocks) * _shear_lever(hand, blocks.position[high].mean(0), recording.finger, blocks.counts)
+        shear = _shear_share(counts, part.shear)
+        slip = shear * _shear_lever(hand, part.position[high].mean(0), recording.finger, counts)
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
@@ -110,60 +113,43 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             if abs(lever[joint]) < max(MIN_LEVER, reach.get(label, 0.0)):
                 continue
             if slip[joint] > _TRUST * abs(lever[joint]):
-                notes.append(f"{label}: loaded by shear while the {recording.name} was pressed; press with the side")
+                notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
                 continue
-            way = _direction(blocks.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
-            way[_at_limit(blocks.current[:, joint], blocks.run)] = 0
+            way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
+            way[_at_limit(part.current[:, joint], part.run)] = 0
             if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
                 notes.append(
-                    f"{label}: hardly moved while the {recording.name} was pressed, held by friction; press "
-                    "on something softer, or more often"
+                    f"{label}: hardly moved while the {name} was pressed, held by friction; press on something softer, "
+                    "or more often"
                 )
                 continue
-            reach[label], source[label] = abs(lever[joint]), recording.name
+            reach[label], source[label] = abs(lever[joint]), name
             # A force read too large makes the gain of the current too small, and leaves the lever arm.
+            known = float(np.hypot(scale.error[name], _HEAT))
             arm = float(np.hypot(_LEVER, slip[joint]) / abs(lever[joint]))
-            known = float(np.hypot(scale.error[recording.name], _HEAT)), arm
-            real[label], sim[label] = (
-                JointPress(force, value[:, joint], way, blocks.press, error)
-                for value, error in zip((blocks.current, torque), known, strict=True)
-            )
-        notes += _press_notes(session, hand, recording, blocks, dead)
+            real[label] = JointPress(force, part.current[:, joint], way, part.press, known)
+            sim[label] = JointPress(force, torque[:, joint], way, part.press, arm)
+        notes += _press_notes(hand, recording, dead, shear)
     try:
-        result = calibrate(
+        calibration = calibrate(
             hand,
             real,
             sim,
             force_per_count=scale.per_count,
-            current_per_count=1e-3,
-            missing="class",
-            serial=session.serial,
-            handedness=session.handedness,
+            serial=session.source.identity.serial_number,
+            handedness=session.source.identity.handedness,
             created=created,
         )
     except CalibrationError as error:
-        why = [note for note in notes if "hardly moved" in note or "by shear" in note]
-        raise CalibrationError("; ".join([str(error), *faint, *why])) from None
-    notes += _zero_note(session, hand)
-    result = dataclasses.replace(result, force_per_torque=fit_force_per_torque(hand, result, real, sim))
+        raise CalibrationError("; ".join([str(error), *notes])) from None
     # With a gauge the absolute scale is known.
-    others = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
-    return Fit(dataclasses.replace(result, notes=(*others, METHOD, *notes)), real, sim, source, scale.sensors)
-
-
-def _felt(pressed: list[Recording], grid: tuple[int, int]) -> tuple[list[tuple[Recording, Blocks]], list[str]]:
-    """The presses that the taxels felt, with their blocks, and a note on each other one: without force no lever arm."""
-    pressed_blocks, notes = [], []
-    for recording in pressed:
-        blocks = make_blocks(recording, grid)
-        if blocks.counts.sum() > 0:
-            pressed_blocks.append((recording, blocks))
-        else:
-            notes.append(
-                f"{recording.name}: left out: no taxel read {ACTIVE:g} counts or more; press on the taxels, or with "
-                "more current (--press.current)"
-            )
-    return pressed_blocks, notes
+    own = [note for note in calibration.notes if not (scale.gauged and note.startswith("only the ratio"))]
+    calibration = dataclasses.replace(
+        calibration,
+        force_per_torque=_force_per_torque(hand, calibration, real, sim),
+        notes=(*own, METHOD, *scale.notes, *notes),
+    )
+    return Fit(calibration, real, sim, source)
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
@@ -176,15 +162,14 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     Raises:
       CalibrationError: no phase is long enough.
     """
-    size = max(round(_BLOCK * recording.rate), 1)
-    phase = np.array(recording.phase)
-    selected = [
-        (phase[first], np.array([np.arange(size) + at for at in range(first, last - size + 1, size)]))
-        for first, last in _runs(phase)
-        if phase[first] in (LOADING, UNLOADING)
-    ]
-    selected = [(name, run) for name, run in selected if len(run) > 1]  # A single block has no speed.
-    runs = [run for _, run in selected]
+    size, phase = max(round(_BLOCK * recording.rate), 1), np.array(recording.phase)
+    cuts = [0, *np.flatnonzero(phase[1:] != phase[:-1]) + 1, len(phase)]
+    names, runs = [], []
+    for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+        starts = range(first, last - size + 1, size)
+        if phase[first] in (LOADING, UNLOADING) and len(starts) > 1:  # A single block has no speed.
+            names.append(phase[first])
+            runs.append(np.array([np.arange(size) + at for at in starts]))
     if not runs:
         raise CalibrationError(
             f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
@@ -192,21 +177,17 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     time, angle = np.array(recording.time), np.array(recording.position)
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
-    rows = np.concatenate(runs)
-    position = angle[rows].mean(1)
+    begins = [before == UNLOADING and name == LOADING for before, name in zip([UNLOADING, *names], names, strict=False)]
+    rows, lengths = np.concatenate(runs), [len(run) for run in runs]
     counts = np.array(recording.counts)[rows].mean(1)
-    active = (counts.max(0) >= ACTIVE).reshape(grid)
-    counts = counts * binary_dilation(active, np.ones((3, 3))).ravel()
-    names = [UNLOADING] + [name for name, _ in selected]
-    begins = [before == UNLOADING and name == LOADING for before, name in zip(names, names[1:], strict=False)]
     return Blocks(
-        counts,
+        counts * active_taxels(counts, grid),
         np.array(recording.current)[rows].mean(1),
-        position,
+        angle[rows].mean(1),
         speed,
         np.array(recording.shear)[rows].mean(1),
-        np.repeat(np.arange(len(runs)), [len(run) for run in runs]),
-        np.repeat(np.cumsum(begins), [len(run) for run in runs]),
+        np.repeat(np.arange(len(runs)), lengths),
+        np.repeat(np.cumsum(begins), lengths),
     )
 
 
@@ -230,11 +211,11 @@ def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> j
     return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
 
 
-def _shear_share(blocks: Blocks) -> float:
+def _shear_share(counts: np.ndarray, shear: np.ndarray) -> float:
     """Shear over normal force by the taxels, at high force."""
-    sums = blocks.counts.sum(-1)
+    sums = counts.sum(-1)
     high = sums > 0.5 * sums.max()
-    return float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
+    return float(np.median(np.linalg.norm(shear[high], axis=-1) / sums[high]))
 
 
 def _shear_lever(hand: Hand, position: np.ndarray, finger: int, counts: np.ndarray) -> np.ndarray:
@@ -264,52 +245,60 @@ def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
     selected = np.zeros(len(current), bool)
     for number in np.unique(run):
-        here = np.flatnonzero(run == number)
-        size = np.abs(current[here])
+        size = np.abs(current[run == number])
         top = size > _TOP * size.max()
-        selected[here] = top & (top.sum() >= _TOP_BLOCKS)
+        selected[run == number] = top & (top.sum() >= _TOP_BLOCKS)
     return selected
 
 
-def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
-    """First index and last + 1 of each run of equal phases."""
-    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
-    return list(zip([0, *cuts], [*cuts, len(phase)], strict=True))
+def _force_per_torque(
+    hand: Hand, calibration: Calibration, real: Mapping[str, JointPress], sim: Mapping[str, JointPress]
+) -> np.ndarray:
+    """Force of a fingertip over the torque of its finger's root joint, as a run reads that torque.
+
+    A run does not know whether a finger closes or opens: the value is half way between the lines of both directions,
+    and the interval reaches to them, and by what the presses and the lever arm leave open beyond. What weight and
+    friction add to the torque is in the lines' offsets.
+
+    Returns:
+      [3, F] N/Nm: value, low, high of the 95 % interval; 0 where nothing pressed.
+    """
+    ratio = np.zeros((3, hand.num_fingers))
+    for finger, joint in enumerate(hand.root_joint):
+        name = hand.joint_names[joint]
+        if name not in real:
+            continue
+        press = real[name]
+        current = np.zeros((len(press.value), hand.num_joints), np.float32)
+        current[:, joint] = press.value
+        torque = np.asarray(joint_torque(calibration, current), float)[:, joint]
+        read = JointPress(press.force, torque, press.direction, press.press, sim[name].gain_error)
+        both = fit_joint(read, "Nm", where=f"{name} in a run")
+        lines = [line for line in (both.loading, both.unloading) if line is not None]
+        gain = np.abs([line.gain for line in lines])
+        known = max(np.ptp(line.gain_interval) / 2 for line in lines)
+        middle, half = gain.mean(), float(np.hypot(known, np.ptp(gain) / 2))
+        if half < middle:
+            ratio[:, finger] = 1.0 / np.array([middle, middle + half, middle - half])
+    return ratio
 
 
-# --- notes ------------------------------------------------------------------------------
-
-
-def _press_notes(
-    session: PressSession, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray
-) -> list[str]:
+def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: float) -> list[str]:
     """Notes on dead taxels, shear, drift and interruption of one press."""
-    notes, finger = [], hand.finger_names[recording.finger]
+    notes = []
     if dead.any():
         notes.append(
-            f"{finger}: dead: {taxel_names(hand, dead)} read nothing while their neighbours were pressed; the fit "
-            "uses the mean of the neighbours, a run reads zero"
+            f"{hand.finger_names[recording.finger]}: dead: {taxel_names(hand, dead)} read nothing while their "
+            "neighbours were pressed; the fit uses the mean of the neighbours, a run reads zero"
         )
-    share = _shear_share(blocks)
-    if share > _SHEAR:
+    if shear > _SHEAR:
         notes.append(
-            f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y, which the fit "
+            f"{recording.name}: shear of {100 * shear:.0f} % of the force by the taxels' x and y, which the fit "
             "ignores; press on something that slides, rolls or is soft"
         )
     left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
     if not recording.finished:
         notes.append(f"{recording.name}: was interrupted; the fit has what was pressed until then, press it again")
-    elif np.median(left) > session.check.release:
+    elif np.median(left) > TOUCHED:
         notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
     return notes
-
-
-def _zero_note(session: PressSession, hand: Hand) -> list[str]:
-    if not len(session.rest_current):
-        return []
-    zero = session.rest_current.mean(0)
-    worst = int(np.abs(zero).argmax())
-    return [
-        f"with the motors off the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): "
-        "this zero error of the sensor is part of the offsets"
-    ]

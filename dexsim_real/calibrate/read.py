@@ -1,20 +1,88 @@
-"""Reads the logs of a press session: one `Recording` per press."""
+"""Reads the logs of this command: marked exchanges, and from them one `Recording` per press."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.options import CheckConfig
-from dexsim_real.calibrate.press_procedure import RELEASED, REST
-from dexsim_real.calibrate.taxel_check import raw_sensing
+from dexsim_real.calibrate.procedure import RELEASED, REST
 from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
+from dexsim_real.wire.identity import Identity
+
+
+class Source(NamedTuple):
+    """How logs were recorded, and on which hand."""
+
+    hardware: HardwareConfig
+    rate: float  # Hz
+    identity: Identity
+
+
+class Mark(NamedTuple):
+    """An annotated exchange."""
+
+    time: float  # s, of the annotation
+    content: dict[str, Any]
+    sent: float  # s
+    command: bytes  # payload
+    answer: np.ndarray | None  # `frames.STATE_BLOCK`
+
+
+def read_log(path: Path, task: str) -> tuple[Source, list[Mark | dict[str, Any]]]:
+    """Source of a log of this task, and in the order of time its exchanges and further settings.
+
+    Raises:
+      LogError: it is another log.
+    """
+    source, entries = None, list[Mark | dict[str, Any]]()
+    # The first exchange that is recorded may be unanswered, and a damaged log may lack any record.
+    sent, sent_at, received = (-1, b""), 0.0, (-1, b"")
+    for record in LogReader(path):
+        content = record.content
+        if record.kind == Kind.META and "task" in content:
+            if content["task"] != task:
+                raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
+            identity = Identity(content["serial"], content["handedness"])
+            source = Source(from_dict(HardwareConfig, content["hardware"]), float(content["rate"]), identity)
+        elif record.kind == Kind.META:
+            entries.append(content)
+        elif record.kind == Kind.SENT:
+            sent, sent_at = content, record.time
+        elif record.kind == Kind.RECEIVED:
+            received = content
+        elif record.kind == Kind.TICK and sent[0] == content["sequence"]:
+            answer = None
+            if received[0] == content["sequence"]:
+                answer = frames.decode_state(received[1][frames.HEADER.size : -2])
+            entries.append(Mark(record.time, content, sent_at, sent[1][frames.HEADER.size : -2], answer))
+    if source is None:
+        raise LogError(f"{path}: the log ends before the hand was ready; record again")
+    return source, entries
+
+
+def read_same(paths: Iterable[Path], task: str, use: Callable[[Source, list[Mark | dict[str, Any]]], None]) -> Source:
+    """Read logs of one hand with one configuration one after another; the source of them all.
+
+    Raises:
+      LogError: a log of another task, hand or configuration than the logs before.
+    """
+    first: Source | None = None
+    for path in paths:
+        with reading(path):
+            source, entries = read_log(Path(path), task)
+            first = first or source
+            for what, own, before in zip(("--hardware options", "--rate", "hand"), source, first, strict=True):
+                if own != before:
+                    raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")
+            use(source, entries)
+    assert first is not None, "no log given"
+    return first
 
 
 @dataclasses.dataclass
@@ -25,7 +93,6 @@ class Recording:
     finger: int
     joints: tuple[int, ...]  # joints that pressed
     rate: float  # samples per second
-    tare: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(frames.TAXELS))  # [N] counts
     phase: list[str] = dataclasses.field(default_factory=list)
     time: list[float] = dataclasses.field(default_factory=list)  # s
     counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] tared, negative ones included
@@ -49,112 +116,63 @@ class Recording:
 class PressSession:
     """The content of one or several logs of presses."""
 
-    hardware: HardwareConfig
-    check: CheckConfig
-    serial: str  # of the hand, as it told it
-    handedness: str
-    rate: float
+    source: Source
     recordings: dict[str, Recording]
-    rest_current: np.ndarray  # [T, J] A, motors off
 
 
-def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
+def read_presses(paths: Iterable[Path], hand: Hand) -> PressSession:
     """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that finished it.
 
     Raises:
       LogError: not a log of presses, or recorded with other settings than the logs before.
     """
-    session: PressSession | None = None
-    for path in paths:
-        with reading(path):
-            newer = _Reader(Path(path), hand).read()
-        if session is None:
-            session = newer
-        elif (newer.hardware, newer.rate) != (session.hardware, session.rate):
-            raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
-        elif newer.serial != session.serial:
-            raise LogError(f"{path}: is of hand {newer.serial!r}, the logs before of hand {session.serial!r}")
-        else:
-            for name, press in newer.recordings.items():
-                before = session.recordings.get(name)
-                # A press that was skipped or missed is in its log without samples.
-                if press.time and (press.finished or before is None or not before.time):
-                    session.recordings[name] = press
-    assert session is not None, "no log given"
-    return session
+    recordings: dict[str, Recording] = {}
+
+    def use(source: Source, entries: list[Mark | dict[str, Any]]) -> None:
+        for name, press in _presses(source, entries, hand).items():
+            before = recordings.get(name)
+            # A press that was skipped or missed is in its log without samples.
+            if before is None or press.time and (press.finished or not before.time):
+                recordings[name] = press
+
+    return PressSession(read_same(paths, "calibrate", use), recordings)
 
 
-class _Reader:
-    def __init__(self, path: Path, hand: Hand):
-        self._path, self._hand, self._number, self._frame = path, hand, -1, b""
+def _presses(source: Source, entries: list[Mark | dict[str, Any]], hand: Hand) -> dict[str, Recording]:
+    sensing, recordings, slant = HandSensing(hand, source.hardware), dict[str, Recording](), list[np.ndarray]()
+    for entry in entries:
+        if isinstance(entry, dict):
+            if "tare" in entry:
+                sensing.tare = np.array(entry["tare"], np.float32)
+            if "placement" in entry:
+                name, finger, joints = (entry["placement"][key] for key in ("name", "finger", "joints"))
+                recordings[name] = Recording(name, finger, tuple(joints), source.rate)
+            continue
+        recording, phase = recordings.get(entry.content["press"]), entry.content["phase"]
+        if recording is not None and "gauge" in entry.content:
+            recording.gauge[phase] = float(entry.content["gauge"])
+        elif entry.answer is not None:
+            taxel = entry.answer["tip"]["taxel"]
+            shear = np.stack([taxel[axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
+            if phase == REST:
+                slant.append(shear)
+            if recording is not None:
+                _add_sample(recording, entry.time, phase, entry.answer, sensing, shear)
+    if slant:  # A taxel may read some x and y that no shear has caused.
+        zero = np.mean(slant, 0)
+        for recording in recordings.values():
+            recording.shear = [shear - zero[recording.finger] for shear in recording.shear]
+    return recordings
 
-    def read(self) -> PressSession:
-        session, rest, slant = None, list[np.ndarray](), list[np.ndarray]()
-        for record in LogReader(self._path):
-            content = record.content
-            if record.kind == Kind.META and "task" in content:
-                session = self._begin(content)
-            elif session is None:
-                continue
-            elif record.kind == Kind.META:
-                self._configure(session, content)
-            elif record.kind == Kind.RECEIVED:
-                self._number, self._frame = content
-            elif record.kind == Kind.TICK:
-                self._sample(session, record.time, content, rest, slant)
-        if session is None:
-            raise LogError(f"{self._path}: the log ends before the hand was ready; record again")
-        session.rest_current = np.array(rest)
-        if slant:  # A taxel may read some x and y that no shear has caused.
-            zero = np.mean(slant, 0)
-            for recording in session.recordings.values():
-                recording.shear = [shear - zero[recording.finger] for shear in recording.shear]
-        return session
 
-    def _begin(self, meta: dict[str, Any]) -> PressSession:
-        if meta["task"] != "calibrate":
-            raise LogError(f"{self._path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
-        hardware = from_dict(HardwareConfig, meta["hardware"])
-        self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
-        check = from_dict(CheckConfig, meta["check"])
-        return PressSession(hardware, check, meta["serial"], meta["handedness"], float(meta["rate"]), {}, np.empty(0))
-
-    def _configure(self, session: PressSession, content: dict[str, Any]) -> None:
-        if "tare" in content:
-            self._sensing.tare = np.array(content["tare"], np.float32)
-        if "placement" in content:
-            name, finger, joints = (content["placement"][key] for key in ("name", "finger", "joints"))
-            session.recordings[name] = Recording(name, finger, tuple(joints), session.rate)
-
-    def _sample(
-        self,
-        session: PressSession,
-        time: float,
-        tick: dict[str, Any],
-        rest: list[np.ndarray],
-        slant: list[np.ndarray],
-    ) -> None:
-        recording = session.recordings.get(tick["press"])
-        if recording is not None and "gauge" in tick:
-            recording.gauge[tick["phase"]] = float(tick["gauge"])
-            return
-        if tick["sequence"] != self._number:
-            return
-        state = frames.decode_state(self._frame[frames.HEADER.size : -2])
-        current = state["joint"]["current"].astype(float) * 1e-3
-        taxel = state["tip"]["taxel"]
-        shear = np.stack([taxel[axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
-        if tick["phase"] == REST:
-            rest.append(current)
-            slant.append(shear)
-        if recording is None:
-            return
-        measured, finger = self._sensing.measure(state), recording.finger
-        recording.tare = self._sensing.tare[finger].astype(float)
-        recording.phase.append(tick["phase"])
-        recording.time.append(time)
-        recording.counts.append(self._raw.measure(state).taxel_force[finger].astype(float) - recording.tare)
-        recording.shown.append(float(measured.taxel_force[finger].sum()) / session.hardware.force_per_count)
-        recording.shear.append(shear[finger])
-        recording.current.append(current)
-        recording.position.append(measured.joint_position.astype(float))
+def _add_sample(
+    press: Recording, time: float, phase: str, state: np.ndarray, sensing: HandSensing, shear: np.ndarray
+) -> None:
+    measured, finger = sensing.measure(state), press.finger
+    press.phase.append(phase)
+    press.time.append(time)
+    press.counts.append(sensing.counts(state)[finger].astype(float) - sensing.tare[finger].astype(float))
+    press.shown.append(float(measured.taxel_force[finger].sum()) / sensing.config.force_per_count)
+    press.shear.append(shear[finger])
+    press.current.append(state["joint"]["current"].astype(float) * 1e-3)
+    press.position.append(measured.joint_position.astype(float))

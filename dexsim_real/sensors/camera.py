@@ -11,11 +11,10 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.names import find_function
@@ -32,7 +31,7 @@ _PIXELS = 2**26  # largest picture of a stream
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraConfig:
+class CameraConfig(Config):
     """Pinhole camera in the palm frame, and colour of the object."""
 
     focal: tuple[float, float] = setting((600.0, 600.0), unit="px", low=1.0, high=1e5)
@@ -53,9 +52,8 @@ class CameraConfig:
     """Smallest area of a mask; smaller ones count as no object."""
 
     def __post_init__(self):
-        validate(self)
-        forward, down = (np.asarray(v, float) for v in (self.forward, self.down))
-        if np.linalg.norm(np.cross(forward, down)) < 1e-3:
+        super().__post_init__()
+        if np.linalg.norm(np.cross(self.forward, self.down)) < 1e-3:
             raise HandError("CameraConfig.forward and CameraConfig.down must not be parallel")
 
 
@@ -83,20 +81,14 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
     rows, columns = np.nonzero(mask)
     if rows.size < config.min_area:
         return None
-    pixel = [
-        (columns.mean() - config.centre[0]) / config.focal[0],
-        (rows.mean() - config.centre[1]) / config.focal[1],
-        1.0,
-    ]
-    ray = np.asarray(pixel) @ camera_axes(config)
+    pixel = (np.array([columns.mean(), rows.mean()]) - config.centre) / config.focal
+    ray = np.append(pixel, 1.0) @ camera_axes(config)
     ray /= np.linalg.norm(ray)
-    line = np.eye(3)[axis]
-    across = 1.0 - ray[axis] ** 2  # squared sine of the angle between ray and line
+    across = 1.0 - ray[axis] ** 2  # squared sine of the angle between ray and axis
     if across < 1e-4:
         return None
     gap = np.asarray(config.position) - reference
-    along = (gap[axis] - ray[axis] * (gap @ ray)) / across
-    return float((reference + along * line)[axis])
+    return float(reference[axis] + (gap[axis] - ray[axis] * (gap @ ray)) / across)
 
 
 class HeightSensor:
@@ -197,7 +189,8 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
 
 def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
     """Mask [H, W] of the pixels of a BGR picture within the colour thresholds, single pixels removed."""
-    cv2 = _opencv()
+    import cv2
+
     hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
     mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
     return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
@@ -223,18 +216,21 @@ def _stream(path: str) -> Masks:
             return None
         magic, width, height, when = _STREAM.unpack(head)
         if magic != _MAGIC or width * height > _PIXELS:
-            raise HandError(f"{path}: what this program sends are no masks")
-        bits = file.read((width * height + 7) // 8)
-        if len(bits) < (width * height + 7) // 8:
+            raise HandError(f"{path}: invalid mask frame; send records of `encode_mask`")
+        size = (width * height + 7) // 8
+        bits = np.frombuffer(file.read(size), np.uint8)
+        if len(bits) < size:
             return None
-        mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=width * height)
-        return when, mask.reshape(height, width).astype(bool)
+        return when, np.unpackbits(bits, count=width * height).reshape(height, width).astype(bool)
 
     return read
 
 
 def _camera(spec: str, segment: Callable[[np.ndarray], np.ndarray]) -> Masks:
-    cv2 = _opencv()
+    try:
+        import cv2
+    except ImportError:
+        raise HandError(f"OpenCV is missing: {install_line('vision')}") from None
     capture = cv2.VideoCapture(int(spec) if spec.isdigit() else spec)
     if not capture.isOpened():
         raise HandError(f"{spec}: the camera cannot be opened; check its number or the file")
@@ -244,11 +240,3 @@ def _camera(spec: str, segment: Callable[[np.ndarray], np.ndarray]) -> Masks:
         return (time.monotonic(), segment(picture)) if sound else None
 
     return read
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError:
-        raise HandError(f"OpenCV is missing: {install_line('vision')}") from None
-    return cv2

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from dexsim.calibration.maps import Calibration, current_from_counts, normalised_torque
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.taxel_zero import ZeroTracker
@@ -19,7 +19,7 @@ _JOINTS = frames.JOINTS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class HardwareConfig:
+class HardwareConfig(Config):
     """Signs, scales and gains of a hand, most of them unconfirmed by public sources.
 
     Check them on your own hand before you turn the motors on (docs/hardware.md).
@@ -48,8 +48,8 @@ class HardwareConfig:
     tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
     """Count above which a taxel cannot be tared: alone it is stuck, and several adjacent ones touch something."""
     tare_sum: float = setting(50.0, unit="count", low=0.0, high=30600.0)
-    """Largest sum of a fingertip's counts when it is tared, single taxels left out: the largest load that taring can
-    hide, 5 N by the vendor's 0.1 N."""
+    """Largest sum of a fingertip's counts when it is tared: the largest load that taring can hide, 5 N by the vendor's
+    0.1 N."""
     track_zero: bool = True
     """Follow the zero of taxels that touch nothing, which wanders with temperature; `tare_sum` bounds it, too."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
@@ -62,7 +62,7 @@ class HardwareConfig:
     """Time constant of the filter on differences of the joint angle."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         for name in ("joint_sign", "joint_offset", "kp", "ki", "kd"):
             if len(getattr(self, name)) != _JOINTS:
                 raise HandError(f"HardwareConfig.{name}: {len(getattr(self, name))} values for {_JOINTS} joints")
@@ -89,11 +89,7 @@ class HandMeasurement:
 
     def finite(self) -> bool:
         """Whether angles, torques and forces are finite."""
-        return bool(
-            np.isfinite(self.joint_position).all()
-            and np.isfinite(self.joint_torque).all()
-            and np.isfinite(self.taxel_force).all()
-        )
+        return all(np.isfinite(part).all() for part in (self.joint_position, self.joint_torque, self.taxel_force))
 
 
 def check_wire(hand: Hand) -> None:
@@ -139,7 +135,7 @@ class HandSensing:
     def measure(self, state: np.ndarray) -> HandMeasurement:
         """A `frames.STATE_BLOCK` in SI units."""
         joint, tip = state["joint"], state["tip"]
-        counts = np.maximum(self._counts(state) - self.tare, 0.0)
+        counts = np.maximum(self.counts(state) - self.tare, 0.0)
         counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
         board, palm = joint["temperature"] & 0xFF, joint["temperature"] >> 8
         return HandMeasurement(
@@ -164,7 +160,7 @@ class HandSensing:
         Raises:
           HandError: a fingertip touches something, or has many stuck taxels.
         """
-        counts = np.asarray(np.mean([self._counts(state) for state in states], axis=0, dtype=np.float32))
+        counts = np.asarray(np.mean([self.counts(state) for state in states], axis=0, dtype=np.float32))
         stuck = judge_rest(self.hand, counts, self.config.tare_limit, self.config.tare_sum)
         self.tare = np.where(stuck, np.float32(np.inf), counts)
         return self._say_masked(stuck)
@@ -179,7 +175,7 @@ class HandSensing:
         Returns:
           One line for each fingertip with taxels masked by this answer.
         """
-        counts = np.maximum(self._counts(state) - self.tare, 0.0)
+        counts = np.maximum(self.counts(state) - self.tare, 0.0)
         stuck = self._stuck.find(counts, limit / self._per_count)
         if stuck is None:
             return []
@@ -195,7 +191,7 @@ class HandSensing:
         """
         before = self.tare
         if self.config.track_zero:
-            self.tare = self._zero.update(time, self._counts(state), before)
+            self.tare = self._zero.update(time, self.counts(state), before)
         return not np.array_equal(self.tare, before)
 
     def _say_masked(self, stuck: np.ndarray) -> list[str]:
@@ -235,7 +231,8 @@ class HandSensing:
             return None
         return state["joint"]["velocity"].astype(np.float32) * np.float32(1e-3) * self._sign
 
-    def _counts(self, state: np.ndarray) -> np.ndarray:
+    def counts(self, state: np.ndarray) -> np.ndarray:
+        """Raw taxel counts [F, N], neither tared nor scaled."""
         taxel = state["tip"]["taxel"]
         if self.config.taxel_axes == "z":
             return taxel["z"].astype(np.float32)

@@ -21,6 +21,9 @@ HEAD = b"\xaa\xaa"
 SIZE = 19
 BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
+_FASTEST = 30.0  # rad/s that an object may turn
+_JUMP = 0.3  # rad, for samples that arrive together
+_SAMPLES = 5  # in a row that are far from the last, and then true: a damaged frame may have a right checksum
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
@@ -70,8 +73,8 @@ class RvcParser:
         self._buffer = bytearray()
         self.damaged = 0
 
-    def feed(self, data: bytes) -> list[np.ndarray]:
-        """Add received bytes; returns the orientations that they complete."""
+    def feed(self, data: bytes) -> list[tuple[int, np.ndarray]]:
+        """Add received bytes; returns index and orientation of the frames that they complete."""
         self._buffer += data
         buffer, quats, done = self._buffer, [], 0
         while (at := buffer.find(HEAD, done)) >= 0 and at + SIZE <= len(buffer):
@@ -79,7 +82,7 @@ class RvcParser:
             if quat is None:
                 self.damaged += 1
             else:
-                quats.append(quat)
+                quats.append((buffer[at + len(HEAD)], quat))
             done = at + (SIZE if quat is not None else 1)
         # The last byte may be the first half of a head, unless it ends a frame.
         del buffer[: at if at >= 0 else max(done, len(buffer) - 1)]
@@ -113,6 +116,9 @@ def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
 class ImuReader:
     """From an IMU's bytes to the orientation of the object in the palm frame.
 
+    A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
+    the last than an object turns is left out, unless the next ones are, too.
+
     Args:
       mount: [4] orientation of the IMU in the object.
       port: name of its port, for messages.
@@ -123,13 +129,20 @@ class ImuReader:
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
+        self._last_index, self._far = -1, 0
 
     def receive(self, time: float, data: bytes) -> None:
         """Update with bytes that were received at a time in s."""
-        if quats := self.parser.feed(data):
-            before = self._newest[1] if self._newest else quats[-1]
-            # q and -q are one orientation: take the one nearer to the last, as in simulation.
-            self._newest = time, quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
+        for index, quat in self.parser.feed(data):
+            if index == self._last_index:
+                continue
+            self._last_index = index
+            when, before = self._newest or (time, quat)
+            angle = 2.0 * math.acos(min(abs(float(quat @ before)), 1.0))
+            self._far = self._far + 1 if angle > _JUMP + _FASTEST * (time - when) else 0
+            if self._far in (0, _SAMPLES):
+                # q and -q are one orientation: take the one nearer to the last, as in simulation.
+                self._newest = time, quat if quat @ before >= 0 else -quat
 
     def calibrate(self, known: np.ndarray) -> None:
         """Align: the object now has the orientation `known` [4] in the palm frame."""

@@ -1,7 +1,7 @@
 """Taxels at rest: which ones are stuck, and whether something touches a fingertip. Taxels that get stuck later.
 
-The skin spreads every load over adjacent taxels. So a taxel that reads much while its neighbours read next to nothing
-is stuck.
+The skin spreads every load over adjacent taxels. So a taxel that reads much while the rest of its fingertip reads next
+to nothing is stuck.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
-_ALONE = 0.1  # share of a taxel's reading up to which its neighbours read next to nothing
+_QUIET = 5.0  # counts up to which the other taxels of a fingertip read next to nothing
 _ADJACENT = 2  # neighbours above the limit that make it a touch: three taxels in a patch
 _MANY = 6  # stuck taxels of a fingertip with which it is of no use
 _ANSWERS = 20  # in which a stuck taxel reads the same
@@ -23,7 +23,7 @@ def judge_rest(hand: Hand, counts: np.ndarray, limit: float, most: float) -> np.
       hand: names, and the lattice of the taxels.
       counts: [F, N] mean raw counts.
       limit: counts above which a taxel is stuck, or touched together with its neighbours.
-      most: sum of a fingertip's counts above which it is touched. Single taxels do not add to it.
+      most: sum of a fingertip's counts above which it is touched; stuck taxels, which are masked, do not add to it.
 
     Returns:
       Mask [F, N] of stuck taxels.
@@ -33,7 +33,7 @@ def judge_rest(hand: Hand, counts: np.ndarray, limit: float, most: float) -> np.
     """
     high = counts > limit
     beside = around(hand, high.astype(np.float32)).sum(0)
-    total = np.where(_alone(hand, counts), 0.0, counts).sum(1)
+    total = np.where(high, 0.0, counts).sum(1)
     for finger, name in enumerate(hand.finger_names):
         patch = high[finger] & (beside[finger] > 0)
         if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
@@ -61,13 +61,14 @@ def taxel_names(hand: Hand, which: np.ndarray) -> str:
 
 
 class StuckTaxels:
-    """Finds taxels that get stuck in a run: alone above what a finger may press, and the same for 20 answers.
+    """Finds taxels that get stuck in a run: above what a finger may press, the same for 20 answers, and nothing else on
+    the fingertip reads anything.
 
-    A real load of that size makes `Safety` ease it, which changes the reading.
+    Beside a load a taxel may also saturate. A real load of that size makes `Safety` ease it, which changes the reading;
+    what is stuck stays until the fingertip is free.
     """
 
     def __init__(self, hand: Hand):
-        self._hand = hand
         self._first = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)  # counts
         self._answers = np.zeros(self._first.shape, int)
 
@@ -78,20 +79,12 @@ class StuckTaxels:
           counts: 0 where a taxel reads no force.
           limit: [F, 1] counts that a finger may read.
         """
-        high = counts > limit
-        same = high & (np.abs(counts - self._first) <= _SAME)
+        same = (counts > limit) & (np.abs(counts - self._first) <= _SAME)
         self._first = np.where(same, self._first, counts)
-        self._answers = np.where(same, self._answers + 1, 0)
+        others = np.where(same, 0.0, counts).max(1, keepdims=True)
+        self._answers = np.where(same & (others <= _QUIET), self._answers + 1, 0)
         stuck = self._answers >= _ANSWERS
-        if not stuck.any():
-            return None
-        stuck &= _alone(self._hand, counts)
         return stuck if stuck.any() else None
-
-
-def _alone(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [F, N] of taxels whose neighbours read next to nothing, compared with themselves."""
-    return around(hand, counts).max(0) <= _ALONE * counts
 
 
 def around(hand: Hand, values: np.ndarray) -> np.ndarray:

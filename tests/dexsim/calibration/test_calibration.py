@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
+from virtual_press import press
 
 from dexsim.actuator.current import Motor
 from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import MIN_FORCE_RANGE, MIN_SAMPLES, JointPress, find_direction, fit_joint
+from dexsim.calibration.joint import JointPress, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
     current_from_counts,
@@ -24,8 +26,7 @@ from dexsim.calibration.maps import (
     taxel_force,
 )
 from dexsim.calibration.plot import plot_calibration
-from dexsim.calibration.press import lever_arms, simulated_press
-from dexsim.calibration.virtual_press import press
+from dexsim.calibration.press import MIN_LEVER, lever_arms
 from dexsim.core.errors import CalibrationError
 from dexsim.core.robust_line import fit_line, long_run, theil_sen
 
@@ -40,17 +41,6 @@ def test_a_line_without_noise_is_found_exactly():
     assert np.ptp(line.gain_interval) < 1e-9
 
 
-def test_theil_sen_is_scipys():
-    rng = np.random.default_rng(0)
-    x = rng.uniform(0, 8, 120)
-    y = 0.05 * x + 0.3 + rng.standard_t(2, 120) * 0.02
-    offset, gain = theil_sen(x, y)
-    reference = scipy.stats.theilslopes(y, x)
-    # Ours leaves out pairs closer than a tenth of the range.
-    assert gain == pytest.approx(reference.slope, rel=0.01)
-    assert offset == pytest.approx(np.median(y - gain * x), abs=1e-12)
-
-
 def test_on_clean_data_it_is_least_squares_and_so_are_its_intervals():
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 8, 4000)
@@ -61,16 +51,16 @@ def test_on_clean_data_it_is_least_squares_and_so_are_its_intervals():
     assert half == pytest.approx(1.96 * reference.stderr / math.sqrt(0.95), rel=0.08)  # 95 % efficiency
     assert line.noise == pytest.approx(0.02, rel=0.05)
     assert line.r_squared == pytest.approx(reference.rvalue**2, abs=0.005)
-    assert line.condition == pytest.approx(np.linalg.cond(np.stack([np.ones(4000), x / x.max()], 1)))
+    offset, gain = theil_sen(x[:120], y[:120])
+    # Ours leaves out pairs closer than a tenth of the range.
+    assert gain == pytest.approx(scipy.stats.theilslopes(y[:120], x[:120]).slope, rel=0.01)
+    assert offset == pytest.approx(np.median(y[:120] - gain * x[:120]), abs=1e-12)
 
 
 def ar1(rng, count, rho):
     white = rng.standard_normal(count) * math.sqrt(1 - rho**2)
-    series = np.empty(count)
-    series[0] = rng.standard_normal()
-    for t in range(1, count):
-        series[t] = rho * series[t - 1] + white[t]
-    return series
+    white[0] /= math.sqrt(1 - rho**2)
+    return scipy.signal.lfilter([1.0], [1.0, -rho], white)
 
 
 @pytest.mark.parametrize(("rho", "least"), [(0.0, 0.92), (0.7, 0.9)])
@@ -79,8 +69,7 @@ def test_intervals_hold_the_truth(rho, least):
     rng, hits = np.random.default_rng(2), np.zeros(2)
     x = np.linspace(0, 8, 400)
     for _ in range(300):
-        y = 0.05 * x + 0.3 + 0.02 * ar1(rng, 400, rho)
-        line = fit_line(x, y)
+        line = fit_line(x, 0.05 * x + 0.3 + 0.02 * ar1(rng, 400, rho))
         hits += [
             line.gain_interval[0] <= 0.05 <= line.gain_interval[1],
             line.offset_interval[0] <= 0.3 <= line.offset_interval[1],
@@ -91,9 +80,8 @@ def test_intervals_hold_the_truth(rho, least):
 def test_the_long_run_variance_of_an_ar1_series():
     """Known: (1 + rho) / (1 - rho) times that of white noise."""
     rng = np.random.default_rng(3)
-    series = np.array([ar1(rng, 4000, 0.5) for _ in range(20)])
-    found = np.mean([long_run(s[:, None])[0, 0] / 4000 for s in series])
-    assert found == pytest.approx(3.0, rel=0.12)
+    variance = np.mean([long_run(ar1(rng, 4000, 0.5)[:, None])[0, 0] / 4000 for _ in range(20)])
+    assert variance == pytest.approx(3.0, rel=0.12)
 
 
 @pytest.mark.parametrize("kind", ["random", "one-sided", "dropped"])
@@ -127,6 +115,7 @@ MOTOR = Motor(
     resolution=0.001,
 )
 LEVER = 0.06
+SOME = ("thumb_bend", "index_joint1", "index_joint2", "index_bend")
 
 
 def recording(seed=0, motor=MOTOR, **options):
@@ -178,22 +167,20 @@ def test_run_time_torque_is_the_motors(hand, fitted):
         np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
     )
     assert np.all(np.abs(unknown - torque) < 2 * band + 0.005)
-    np.testing.assert_allclose(
-        normalised_torque(calibration, loading, 1.0),
-        joint_torque(calibration, loading, 1.0) / hand.torque_limit,
-        rtol=1e-5,
-    )
+    normalised = normalised_torque(calibration, loading, 1.0)
+    np.testing.assert_allclose(normalised, joint_torque(calibration, loading, 1.0) / hand.torque_limit, rtol=1e-5)
 
 
-def test_a_hand_that_counts_backwards(hand):
+def test_a_hand_that_counts_backwards(hand, fitted):
     """Currents negative while closing, as the XHand's: torques positive all the same."""
-    calibration, real, sim = calibrated(hand)
+    calibration, real, sim = fitted
     turned = {name: JointPress(p.force, -p.value) for name, p in real.items()}
-    other = calibrate(hand, turned, sim, created="2026-01-01")
+    other = calibrate(hand, turned, sim)
     current = jnp.linspace(0.05, 0.6, 12)
     np.testing.assert_allclose(joint_torque(other, -current), joint_torque(calibration, current), rtol=1e-4)
     force, value = normalise(other.real, 0, turned["thumb_bend"].force, turned["thumb_bend"].value)
-    assert np.quantile(value, 0.99) > 0.9
+    for axis in (force, value):  # the paper's [0, 1]
+        assert axis.max() == pytest.approx(1.0, abs=0.02) and axis.min() > -0.1
 
 
 def test_maps_under_jit_and_vmap(fitted):
@@ -210,20 +197,11 @@ def test_maps_under_jit_and_vmap(fitted):
     np.testing.assert_allclose(current_from_counts(calibration, jnp.array([250.0])), 0.25)
 
 
-def test_taxel_counts_become_newtons(hand, fitted):
+def test_taxel_counts_become_newtons(fitted):
     calibration = dataclasses.replace(fitted[0], force_per_count=np.array([0.1, 0.2, 0.1, 0.1, 0.3]))
     counts = np.arange(5)[:, None] + np.array([[-7, 0, 10]])
     expected = np.maximum(counts * calibration.force_per_count[:, None], 0)
     np.testing.assert_allclose(taxel_force(calibration, counts), expected, rtol=1e-6)
-
-
-def test_both_sides_are_normalised_to_the_unit_square(fitted):
-    calibration, real, sim = fitted
-    for joint, name in enumerate(calibration.joint_names):
-        for side, data in ((calibration.real, real), (calibration.sim, sim)):
-            force, value = normalise(side, joint, data[name].force, data[name].value)
-            assert force.max() == pytest.approx(1.0, abs=0.02) and value.max() == pytest.approx(1.0, abs=0.02)
-            assert force.min() >= 0 and value.min() > -0.1
 
 
 def test_alignment_tells_where_the_papers_maxima_mislead(hand):
@@ -231,20 +209,17 @@ def test_alignment_tells_where_the_papers_maxima_mislead(hand):
     offset of a quarter of the maximum they do not, by that share."""
     plain = Motor(torque_constant=1.0)
     biased = Motor(torque_constant=1.0, bias=LEVER * 8.0 / 3)
-    names = hand.joint_names
-    sim = {n: recording(0, plain, peak=16.0, force_noise=0.0) for n in names}
+    sim = {n: recording(0, plain, peak=16.0, force_noise=0.0) for n in hand.joint_names}
     for motor, ratio in ((plain, 1.0), (biased, 0.75)):
-        real = {n: recording(0, motor, force_noise=0.0) for n in names}
-        found = calibrate(hand, real, sim)
-        np.testing.assert_allclose(alignment(found), ratio, rtol=0.01)
-        assert any("maxima" in note for note in found.notes) == (ratio != 1.0)
+        real = {n: recording(0, motor, force_noise=0.0) for n in hand.joint_names}
+        calibration = calibrate(hand, real, sim)
+        np.testing.assert_allclose(alignment(calibration), ratio, rtol=0.01)
+        assert any("maxima" in note for note in calibration.notes) == (ratio != 1.0)
 
 
 def test_joints_without_a_recording_take_their_class(hand):
     some = ("thumb_bend", "thumb_rota2", "index_joint1", "index_joint2")
-    with pytest.raises(CalibrationError, match="thumb_rota1: no recording on the hand side"):
-        calibrated(hand, names=some)
-    calibration, *_ = calibrated(hand, names=some, missing="class")
+    calibration, *_ = calibrated(hand, names=some)
     strong, weak = [0, 4], [2, 5]
     for joint, name in enumerate(hand.joint_names):
         if name not in some:
@@ -252,44 +227,29 @@ def test_joints_without_a_recording_take_their_class(hand):
             np.testing.assert_allclose(calibration.real.gain[:, joint], calibration.real.gain[:, mates].mean(1))
             assert np.all(calibration.real.samples[:, joint] == 0)
             assert any(note.startswith(f"{name}: not recorded") for note in calibration.notes)
-
-
-SOME = ("thumb_bend", "index_joint1", "index_joint2", "index_bend")
-
-
-def test_what_could_not_be_read_again_is_not_made(hand):
+    with pytest.raises(CalibrationError, match="thumb_rota2: no recording of any joint with 0.4 Nm to take over"):
+        calibrated(hand, names=("thumb_bend",))
+    with pytest.raises(CalibrationError, match="no joint 'elbow'"):
+        calibrate(hand, {"elbow": recording()}, {})
     with pytest.raises(CalibrationError, match="calibration: thumb: force_per_count = 2: must be between"):
-        calibrated(hand, names=SOME, missing="class", force_per_count=2.0)
-    with pytest.raises(CalibrationError, match="calibration: current_per_count = 1: must be between"):
-        calibrated(hand, names=SOME, missing="class", current_per_count=1.0)
+        calibrated(hand, names=some, force_per_count=2.0)  # What could not be read again is not made.
 
 
 @pytest.mark.parametrize("side", ["on the hand", "in simulation"])
 def test_a_class_of_both_signs_has_no_mean(hand, side):
-    _, *sides = calibrated(hand, names=SOME, missing="class")
+    _, *sides = calibrated(hand, names=SOME)
     turned = sides[side == "in simulation"]
     turned["index_joint2"] = dataclasses.replace(turned["index_joint2"], value=-turned["index_joint2"].value)
-    with pytest.raises(
-        CalibrationError, match=f"index_joint2: its gain {side} .* index_bend: .* or record [a-z_0-9]+$"
-    ):
-        calibrate(hand, *sides, missing="class")
+    with pytest.raises(CalibrationError, match=f"gain signs differ {side} between index_joint2 and index_bend"):
+        calibrate(hand, *sides)
 
 
-def test_what_the_data_cannot_separate_is_said(fitted):
-    notes = " ".join(fitted[0].notes)
-    for words in ("force sensor", "product", "offset"):
-        assert words in notes
+def test_one_direction_stands_for_both(fitted):
     data = recording()
     only = JointPress(data.force, data.value, np.where(find_direction(data.force) > 0, 1, 0))
     one_way = fit_joint(only, "A")
     assert one_way.unloading is None and math.isnan(one_way.friction)
     assert any("friction and offset are not apart" in note for note in one_way.notes)
-    force = np.linspace(8.0, 8.8, 400)
-    narrow = fit_joint(JointPress(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
-    assert any("gain and offset trade off" in note for note in narrow.notes)
-
-
-# --- loading and unloading ----------------------------------------------------------------------
 
 
 def test_directions_of_a_noisy_triangle():
@@ -297,81 +257,40 @@ def test_directions_of_a_noisy_triangle():
     phase = np.arange(600) / 600 * 3 % 1
     force = 8 * (1 - np.abs(2 * phase - 1)) + 0.1 * rng.standard_normal(600)
     force[rng.permutation(600)[:20]] = 0.0  # dropped reads
-    found = find_direction(force)
-    truth = np.where(phase < 0.5, 1, -1)
-    assert np.mean(found[found != 0] == truth[found != 0]) > 0.99
-    assert 0.02 < np.mean(found == 0) < 0.2
-    assert set(np.unique(find_direction(-force + 8))) == {-1, 0, 1}
+    direction = find_direction(force)
+    assert np.mean(direction[direction != 0] == np.where(phase < 0.5, 1, -1)[direction != 0]) > 0.99
+    assert 0.02 < np.mean(direction == 0) < 0.2
+    assert np.all(find_direction(np.linspace(5, 0, 100))[15:-1] == -1)
 
 
-def test_a_single_ramp_is_one_direction():
-    found = find_direction(np.linspace(5, 0, 100))
-    assert np.all(found[15:-1] == -1)
+BAD = {
+    "at least 20": lambda f, v: (f[:10], v[:10]),
+    "at least 20 samples of rising": lambda f, v: (f[:21], v[:21]),
+    "one length": lambda f, v: (f[:-1], v),
+    "not a number": lambda f, v: (np.where(np.arange(600) == 3, np.inf, f), v),
+    "force stays between 4.* press": lambda f, v: (4 + 0.02 * f, v),
+    "does not follow the force": lambda f, v: (f, 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)),
+    "value sits at its maximum .* saturated": lambda f, v: (f, np.minimum(v, 0.05)),
+    "force sits at its maximum .* saturated": lambda f, v: (np.minimum(f, 2.0), v),
+    "give A, not counts": lambda f, v: (f, 1000 * v),
+    "give N, not counts": lambda f, v: (1000 * f, v),
+    "mixed up": lambda f, v: (f, v * np.where(np.arange(600) % 200 < 100, 1, -1)),
+}
 
 
-# --- refusals -----------------------------------------------------------------------------------
-
-
-def broken(**changes):
+@pytest.mark.parametrize("says", BAD)
+def test_bad_recordings_are_refused_in_one_line(says):
     data = recording()
-    force, value = data.force.copy(), data.value.copy()
-    for name, change in changes.items():
-        force, value = {
-            "force": lambda f, v, c=change: (c(f), v),
-            "value": lambda f, v, c=change: (f, c(v)),
-            "both": lambda f, v, c=change: (c(f), c(v)),
-        }[name](force, value)
-    return JointPress(force, value)
-
-
-def put(index, number):
-    def change(array):
-        array[index] = number
-        return array
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"both": lambda a: a[:10]}, "10 samples: at least 20"),
-        ({"both": lambda a: a[:21]}, "18 samples loading and 0 unloading: at least 20"),
-        ({"force": lambda f: f[:-1]}, "one length"),
-        ({"value": put(17, np.nan)}, "sample 17 is not a number .*leave out"),
-        ({"force": put(3, np.inf)}, "sample 3 is not a number"),
-        ({"force": lambda f: 4 + 0.02 * f}, "force stays between 4.* press"),
-        (
-            {"value": lambda v: 0 * v + 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)},
-            "does not follow the force",
-        ),
-        ({"value": lambda v: np.minimum(v, 0.05)}, "saturated"),
-        ({"force": lambda f: np.minimum(f, 2.0)}, "saturated"),
-        ({"value": lambda v: 1000 * v}, "give it in A"),
-        ({"value": lambda v: np.where(np.arange(600) < 200, 1000 * v, v)}, "give it in A|mixed"),
-        ({"value": lambda v: np.where(np.arange(600) < 90, 1000 * v, v)}, "mixed"),
-        ({"force": lambda f: 1000 * f}, "force of .* N: give it in N"),
-        ({"force": lambda f: f - 5}, "tare"),
-    ],
-)
-def test_bad_recordings_are_refused_in_one_line(changes, says):
-    with pytest.raises(CalibrationError, match=says) as caught:
-        fit_joint(broken(**changes), "A", where="thumb_bend on the hand")
-    assert "\n" not in str(caught.value) and str(caught.value).startswith("thumb_bend on the hand")
+    with pytest.raises(CalibrationError, match=f"^thumb_bend on the hand.*{says}") as error:
+        fit_joint(JointPress(*BAD[says](data.force, data.value)), "A", where="thumb_bend on the hand")
+    assert "\n" not in str(error.value)
 
 
 def test_a_few_saturated_samples_are_left_out():
-    data = recording(seed=1, motor=dataclasses.replace(MOTOR, limit=0.55))
-    fit = fit_joint(data, "A")
+    fit = fit_joint(recording(seed=1, motor=dataclasses.replace(MOTOR, limit=0.55)), "A")
     assert any("saturated samples left out" in note for note in fit.notes)
     assert fit.loading.gain == pytest.approx(LEVER / (0.9 * 0.8), rel=0.02)
-    unclipped = fit_joint(recording(seed=1), "A")
-    assert not any("saturated" in note for note in unclipped.notes)
-
-
-def test_names_that_the_hand_does_not_have(hand):
-    with pytest.raises(CalibrationError, match="no joint 'elbow'"):
-        calibrate(hand, {"elbow": recording()}, {})
+    assert not any("saturated" in note for note in fit_joint(recording(seed=1), "A").notes)
 
 
 # --- file ---------------------------------------------------------------------------------------
@@ -379,7 +298,8 @@ def test_names_that_the_hand_does_not_have(hand):
 
 def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
     path = tmp_path / "policy" / "calibration.toml"
-    original = dataclasses.replace(fitted[0], serial='left "A"\\3')
+    side = dataclasses.replace(fitted[0].real, friction=np.full(12, np.nan))  # a direction was not recorded
+    original = dataclasses.replace(fitted[0], real=side, serial='left "Ä"\\3')
     save_calibration(path, original)
     back = load_calibration(path, hand)
     assert jax.tree.structure(back) == jax.tree.structure(original)
@@ -387,13 +307,6 @@ def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
         np.testing.assert_array_equal(ours, theirs)
     text = path.read_text()
     assert 'name = "thumb_bend"' in text and "# A" in text  # for people too
-
-
-def test_a_missing_direction_survives_the_file(hand, fitted, tmp_path):
-    nan = np.full(12, np.nan)
-    one_way = dataclasses.replace(fitted[0], real=dataclasses.replace(fitted[0].real, friction=nan))
-    save_calibration(tmp_path / "c.toml", one_way)
-    assert np.all(np.isnan(load_calibration(tmp_path / "c.toml", hand).real.friction))
 
 
 def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
@@ -407,38 +320,6 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("version = 1", "version = 2", "is of version 2, this library reads up to 1: upgrade"),
-        ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
-        ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
-        ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
-        ("torque_scale = 1.1", "torque_scale = 0.0", "thumb_bend: torque_scale = 0: must be between"),
-        ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
-        ("friction = ", "fiction = ", "'friction' must hold 1 number"),
-        ("complete = true", "complete = false", "cut off"),
-    ],
-)
-def test_other_files_are_refused_in_one_line(hand, fitted, tmp_path, old, new, says):
-    path = tmp_path / "c.toml"
-    save_calibration(path, fitted[0])
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-    with pytest.raises(CalibrationError, match=says) as caught:
-        load_calibration(path, hand)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file_and_a_place_that_cannot_be_written(fitted, tmp_path):
-    with pytest.raises(CalibrationError, match="cannot be read"):
-        load_calibration(tmp_path / "none.toml")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CalibrationError, match="cannot be written"):
-        save_calibration(tmp_path / "file" / "c.toml", fitted[0])
-
-
 def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
     path = tmp_path / "c.toml"
     save_calibration(path, fitted[0])
@@ -447,24 +328,21 @@ def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
     with pytest.raises(CalibrationError, match="No space left"):
         save_calibration(path, dataclasses.replace(fitted[0], serial="new"))
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["c.toml"]
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        load_calibration(tmp_path / "none.toml")
 
 
 @pytest.mark.slow
 def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
+    from PIL import Image
+
     calibration, real, sim = fitted
     path = tmp_path / "c.png"
     plot_calibration(path, calibration, real, sim, ("thumb_bend", "index_joint1"))
-    from PIL import Image
-
     picture = np.asarray(Image.open(path).convert("RGB"), int)
-    colourful = np.mean(np.ptp(picture, axis=-1) > 60)
-    assert picture.shape[1] > 800 and colourful > 0.003
+    assert picture.shape[1] > 800 and np.mean(np.ptp(picture, axis=-1) > 60) > 0.003
     with pytest.raises(CalibrationError, match="nothing to draw"):
         plot_calibration(path, calibration, {}, sim)
-
-
-def test_thresholds_are_what_the_messages_say():
-    assert MIN_SAMPLES == 20 and MIN_FORCE_RANGE == 0.5
 
 
 # --- the simulation's side --------------------------------------------------------------------------
@@ -486,28 +364,26 @@ def test_lever_arms_are_c_mujocos(hand):
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jacobian, None, point, body)
         torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
-        wanted = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
-        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), wanted, atol=2e-6)
+        expected = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
+        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), expected, atol=2e-6)
 
 
 def test_a_hand_pressed_finger_by_finger(hand):
     """Both sides from the same presses: each joint's torque comes back through its current."""
     posture = np.clip(np.full(12, 0.5), hand.joint_lower, hand.joint_upper)
-    triangle = 8 * (1 - np.abs(2 * (np.arange(600) / 200 % 1) - 1))
     real, sim, arms = {}, {}, {}
-    for finger in hand.finger_names:
-        for name, data in simulated_press(hand, posture, finger, triangle).items():
-            arm = data.value[50] / data.force[50]
-            if name not in arms or abs(arm) > abs(arms[name]):
-                sim[name], arms[name] = data, arm
+    for finger in range(5):
+        for name, arm in zip(hand.joint_names, lever_arms(hand, posture, finger, 66), strict=True):
+            if abs(arm) >= MIN_LEVER and abs(arm) > abs(arms.get(name, 0.0)):
+                arms[name] = arm
                 real[name] = press(MOTOR, jax.random.key(len(real)), lever=arm, force_noise=0.03)
+                force = real[name].force
+                sim[name] = JointPress(force, force * arm)
     assert len(arms) >= 10 and all(0.005 < abs(arm) < 0.12 for arm in arms.values())
-    found = calibrate(hand, real, sim, missing="class")
+    calibration = calibrate(hand, real, sim)
     for name, arm in arms.items():
         joint = hand.joint_names.index(name)
         current = np.zeros(12)
         current[joint] = 5.0 * arm / (0.9 * 0.8) + math.copysign(0.02, arm) + 0.004
-        direction = np.ones(12)
-        assert float(joint_torque(found, current, direction)[joint]) == pytest.approx(5.0 * arm, rel=0.06), name
-    with pytest.raises(CalibrationError, match="no finger 'toe'"):
-        simulated_press(hand, posture, "toe", triangle)
+        torque = float(joint_torque(calibration, current, np.ones(12))[joint])
+        assert torque == pytest.approx(5.0 * arm, rel=0.06), name

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.stats import t as student
+from virtual_press import varied_presses
 
 from dexsim.calibration.joint import JointPress, find_presses, fit_joint
 from dexsim.calibration.sensor import Estimate, TaxelPress, fit_finger
-from dexsim.calibration.virtual_press import varied_presses
 from dexsim.core.robust_line import Line, fit_line, regress
 
 TRIALS = 40
@@ -90,7 +90,7 @@ def test_what_no_sample_shows_is_added_in_quadrature():
 
 
 def test_few_presses_are_said():
-    force, value = varied_presses(np.random.default_rng(5), presses=2)
-    assert any("fewer than 3 presses" in note for note in fit_joint(JointPress(force, value), "A").notes)
-    force, value = varied_presses(np.random.default_rng(5), presses=3)
-    assert not any("fewer than" in note for note in fit_joint(JointPress(force, value), "A").notes)
+    for presses, said in ((2, True), (3, False)):
+        force, value = varied_presses(np.random.default_rng(5), presses=presses)
+        notes = fit_joint(JointPress(force, value), "A").notes
+        assert any("fewer than 3 presses" in note for note in notes) == said

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dexsim.calibration.sensor import TaxelPress, fit_finger
-from dexsim.core.errors import DexsimError
+from dexsim.calibration.sensor import TaxelPress, fit_finger, fit_skin
+from dexsim.core.errors import CalibrationError
 
 TAXELS, AREA = 40, np.full(40, 4e-6)
 
@@ -48,25 +48,6 @@ def test_outliers_do_not_bend_the_line():
     assert abs(fit.offset.value - 1.5) < 0.2 * abs(least_squares - 1.5)
 
 
-def test_saturated_samples_are_left_out():
-    press = recording(2)
-    clipped = TaxelPress(force=press.force, reading=np.minimum(press.reading, 5.0))
-    assert fit_finger(clipped).gain.value < 8.0
-    fit = fit_finger(clipped, saturation=5.0)
-    assert fit.gain.value == pytest.approx(9.0, rel=0.02) and "saturated" in fit.notes[0]
-
-
-@pytest.mark.parametrize("kept", [0, 5])
-def test_a_recording_that_is_saturated_is_refused(kept):
-    press = recording(2)
-    press.reading[kept:] = 255.0
-    with pytest.raises(
-        DexsimError, match=f"sensor fit: {kept} of 150 samples are not saturated; at least 8 "
-    ) as caught:
-        fit_finger(press, saturation=255.0)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("lost", [1, 12])
 def test_lost_readings_do_not_cost_the_others(lost):
     """Zeros, one of them at the largest force: the samples below are not silent because of it."""
@@ -80,31 +61,15 @@ def test_lost_readings_do_not_cost_the_others(lost):
     assert fit.residual == pytest.approx(clean.residual, rel=0.05)
 
 
-def plate(seed, c10, c01, deepest, noise=0.02):
-    """A flat plate on 24 of 40 taxels, 2 mm of skin, pushed in steps."""
-    rng = np.random.default_rng(seed)
+def test_the_skins_stiffness_is_found():
+    """A flat plate on 24 of 40 taxels, 2 mm of skin, pushed in steps, with 2 % of noise."""
+    rng = np.random.default_rng(3)
     depth = np.zeros((80, TAXELS))
-    depth[:, :24] = rng.uniform(0.02, deepest, 80)[:, None] * 0.002
+    depth[:, :24] = rng.uniform(0.02, 0.5, 80)[:, None] * 0.002
     stretch = 1 - depth / 0.002
-    force = np.sum(2 * (stretch**-2 - stretch) * (c10 + c01 / stretch) * AREA, 1)
-    reading = force[:, None] * depth / np.maximum(depth.sum(1, keepdims=True), 1e-12)
-    force = force * (1 + noise * rng.normal(size=80))
-    return TaxelPress(force=force, reading=reading, depth=depth, area=AREA)
-
-
-def test_the_material_is_found():
-    fit = fit_finger(plate(3, 0.1e6, 0.0, 0.5), thickness=0.002)
-    assert fit.c10.value == pytest.approx(0.1e6, rel=0.02) and fit.c10.low <= 0.1e6 <= fit.c10.high
-    assert fit.c01.value == 0
-
-
-def test_two_terms_need_deep_presses():
-    deep = fit_finger(plate(4, 0.06e6, 0.04e6, 0.7, noise=0.002), thickness=0.002, two_terms=True)
-    assert deep.c10.value == pytest.approx(0.06e6, rel=0.15) and deep.c01.value == pytest.approx(0.04e6, rel=0.15)
-    assert deep.c01.low <= 0.04e6 <= deep.c01.high and not deep.notes
-    shallow = fit_finger(plate(5, 0.06e6, 0.04e6, 0.1, noise=0.1), thickness=0.002, two_terms=True)
-    assert "cannot be told apart" in shallow.notes[0]
-    assert float(shallow.notes[0].split()[-2]) == pytest.approx(0.1e6, rel=0.1)
+    force = np.sum(2 * (stretch**-2 - stretch) * 0.1e6 * AREA, 1) * (1 + 0.02 * rng.normal(size=80))
+    stiffness = fit_skin(TaxelPress(force=force, reading=depth), depth, AREA, thickness=0.002)
+    assert stiffness.value == pytest.approx(0.1e6, rel=0.02) and stiffness.low <= 0.1e6 <= stiffness.high
 
 
 def test_useless_recordings_are_refused():
@@ -112,13 +77,9 @@ def test_useless_recordings_are_refused():
     for press, words in (
         (TaxelPress(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
         (TaxelPress(force=np.full(150, 2.0), reading=good.reading), "different forces"),
-        (TaxelPress(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
-        (TaxelPress(force=good.force, reading=good.reading, press=np.zeros(20, int)), r"press \(20,\), expected"),
         (TaxelPress(force=good.force, reading=0 * good.reading), "above the activation threshold"),
         (TaxelPress(force=good.force, reading=100 - good.reading), "do not rise"),
         (TaxelPress(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
-        (TaxelPress(force=good.force, reading=good.reading, depth=good.reading), "areas"),
     ):
-        with pytest.raises(DexsimError, match=words) as caught:
+        with pytest.raises(CalibrationError, match=words):
             fit_finger(press)
-        assert "\n" not in str(caught.value)

@@ -1,8 +1,7 @@
-"""Identification against known truths: our model with noise, C MuJoCo, refusals, advice."""
+"""Identification against known truths: our model with noise, C MuJoCo, refusals, what the data do not tell."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -10,12 +9,11 @@ import pytest
 import scipy.signal
 import scipy.stats
 
-from dexsim.actuator.drive import Actuator, apply_friction, delayed_target, joint_torque
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import Excitation, chirp, excitation, joint_excitation, steps, triangles
 from dexsim.identification.identify import FIT, check_log, evaluate, identify
-from dexsim.identification.joint import JointLog, segments, simulate, with_defaults
-from dexsim.identification.report import uncertainty
+from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
+from dexsim.identification.uncertainty import uncertainty
 
 PERIOD, SUBSTEPS = 0.015, 3
 TRUTH = dict(
@@ -28,54 +26,24 @@ TRUTH = dict(
     viscous_friction=0.005,
     dead_band=0.006,
 )
+FREE = TRUTH | {"dead_band": 0.0}
 GUESS = dict(stiffness=3.5, damping=0.13, stall_torque=0.45, no_load_speed=12.0, inertia=0.0012)
 TARGET = joint_excitation(Excitation(period=PERIOD), 0.9, 0.8)
 SHORT = joint_excitation(
-    Excitation(
-        period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, slow_speed=1.0, reversal_cycles=2, rest=0.3
-    ),
-    0.9,
-    0.8,
+    Excitation(period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, reversal_cycles=2, rest=0.3), 0.9, 0.8
 )
 HOLDOUT = joint_excitation(
     Excitation(period=PERIOD, amplitude=0.2, chirp_frequency=(0.5, 2.5), step_count=3, chirp_seconds=3.0), 1.0, 0.8
 )
 
 
-def synthetic_log(
-    key,
-    values,
-    target,
-    *,
-    period=PERIOD,
-    substeps=SUBSTEPS,
-    latency=0,
-    position_noise=0.0,
-    position_resolution=0.0,
-    torque_noise=0.0,
-    with_torque=True,
-):
+def log_of(truth, seed=0, target=TARGET, latency=2, noise=0.001, torque_noise=0.01):
     """A log of the model itself, which starts at the first target: known truth with the noise of a real one."""
-    target = np.asarray(target, float)
-    values = {"start": float(target[0])} | values
-    position, torque = simulate(
-        with_defaults(values, JointLog(period, target, target, name="joint")),
-        jnp.asarray(target, jnp.float32),
-        jnp.int32(latency),
-        jnp.float32(period / substeps),
-        substeps,
-    )
-    keys = jax.random.split(key)
-    position = np.asarray(position + position_noise * jax.random.normal(keys[0], position.shape))
-    if position_resolution > 0:
-        position = np.round(position / position_resolution) * position_resolution
-    torque = np.asarray(torque + torque_noise * jax.random.normal(keys[1], torque.shape))
-    return JointLog(period, target, position.astype(float), torque.astype(float) if with_torque else None, "joint")
-
-
-def log_of(truth, seed=0, target=TARGET, latency=2, **options):
-    options = dict(position_noise=0.001, position_resolution=0.0005, torque_noise=0.01) | options
-    return synthetic_log(jax.random.key(seed), truth, target, latency=latency, **options)
+    values = with_defaults({"start": float(target[0])} | truth, JointLog(PERIOD, target, target))
+    target32, timestep = jnp.asarray(target, jnp.float32), jnp.float32(PERIOD / SUBSTEPS)
+    position, torque = simulate(values, target32, jnp.int32(latency), timestep, SUBSTEPS)
+    errors = np.random.default_rng(seed).standard_normal((2, len(target)))
+    return JointLog(PERIOD, target, position + noise * errors[0], torque + torque_noise * errors[1])
 
 
 # --- excitation ----------------------------------------------------------------------------------
@@ -113,108 +81,35 @@ def test_the_hand_stays_within_its_limits(hand):
         excitation(hand, config, joints=("elbow",))
 
 
-# --- the joint alone -----------------------------------------------------------------------------------
-
-
-def plain_simulation(truth, target, latency):
-    """The same joint written down again, sub-step by sub-step, with the drive's public functions."""
-    full = {"efficiency": 1.0, "gravity_cos": 0.0, "gravity_sin": 0.0, "encoder_bias": 0.0} | truth
-    drive = Actuator(
-        *(
-            jnp.float32(full[n])
-            for n in ("stiffness", "damping", "dead_band", "stall_torque", "no_load_speed", "efficiency")
-        ),
-        encoder_bias=jnp.float32(full["encoder_bias"]),
-        coulomb_friction=jnp.float32(full["coulomb_friction"]),
-        viscous_friction=jnp.float32(full["viscous_friction"]),
-    )
-    dt, substep_of = (
-        PERIOD / SUBSTEPS,
-        jax.jit(
-            lambda wanted, q, v: (
-                joint_torque(drive, wanted, 0.0, q, v),
-                apply_friction(
-                    drive,
-                    joint_torque(drive, wanted, 0.0, q, v)
-                    - full["gravity_cos"] * jnp.cos(q)
-                    - full["gravity_sin"] * jnp.sin(q),
-                    v,
-                    full["inertia"] / dt,
-                ),
-            )
-        ),
-    )
-    q, v, rows, active = np.float32(target[0] - full["encoder_bias"]), np.float32(0), [], target[0]
-    for k in range(len(target)):
-        rows.append((q + full["encoder_bias"], float(substep_of(active, q, v)[0])))
-        for substep in range(SUBSTEPS):
-            active = float(delayed_target(jnp.int32(substep), latency, target[max(k - 1, 0)], target[k]))
-            v = np.float32(v + dt / full["inertia"] * float(substep_of(active, q, v)[1]))
-            q = np.float32(q + dt * v)
-    return np.array(rows)
-
-
-@pytest.mark.parametrize("latency", [0, 2, 3])
-def test_the_model_is_the_drive_on_an_inertia(latency):
-    truth = TRUTH | dict(gravity_cos=0.01, gravity_sin=-0.02, encoder_bias=0.03)
-    target = np.concatenate([np.full(5, 0.9), 0.9 + 0.3 * np.sin(np.arange(60) * 0.3), np.full(20, 0.8)])
-    ours = log_of(truth, target=target, latency=latency, position_noise=0.0, torque_noise=0.0, position_resolution=0.0)
-    theirs = plain_simulation(truth, target.astype(np.float32), latency)
-    ours = np.stack([ours.position, ours.torque], 1)
-    # The first reading is before any encoder offset is held against the start.
-    shift = theirs[0, 0] - ours[0, 0]
-    assert abs(shift) < 1e-6 or shift == pytest.approx(-0.03, abs=1e-6) or shift == pytest.approx(0.03, abs=1e-6)
-    if abs(shift) < 1e-6:
-        np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=2e-4)
-        np.testing.assert_allclose(ours[:, 1], theirs[:, 1], atol=2e-3)
-
-
-def test_segments_begin_where_the_joint_rests():
-    log = log_of(TRUTH)
-    segment, angle = segments(log)
-    assert segment[0] == 0 and segment[-1] + 1 == len(angle) and np.all(np.diff(segment) >= 0)
-    assert 10 <= len(angle) <= 22  # rests, pauses and steps
-    firsts = np.flatnonzero(np.diff(segment)) + 1
-    still = synthetic_log(jax.random.key(0), TRUTH, TARGET, period=PERIOD, substeps=SUBSTEPS, latency=2)
-    speed = np.abs(np.gradient(still.position)) / PERIOD
-    assert np.all(speed[firsts] < 0.02)
-    np.testing.assert_allclose(angle[1:], still.position[firsts], atol=1.5e-3)
-
-
 # --- recovery ------------------------------------------------------------------------------------------
 
 
-def random_truth(seed):
-    rng = np.random.default_rng(seed)
-    return dict(
-        stiffness=rng.uniform(2, 4),
-        damping=rng.uniform(0.06, 0.15),
-        stall_torque=rng.uniform(0.35, 0.45),
-        no_load_speed=12.0,
-        inertia=0.0012,
-        coulomb_friction=rng.uniform(0.005, 0.03),
-        viscous_friction=rng.uniform(0.002, 0.01),
-        dead_band=rng.uniform(0.002, 0.012),
-    ), int(rng.integers(5))
+def test_segments_begin_where_the_joint_rests():
+    segment, angle = segments(log_of(TRUTH))
+    assert segment[0] == 0 and segment[-1] + 1 == len(angle) and np.all(np.diff(segment) >= 0)
+    assert 10 <= len(angle) <= 22  # rests, pauses and steps
+    firsts = np.flatnonzero(np.diff(segment)) + 1
+    quiet = log_of(TRUTH, noise=0.0)
+    assert np.all(np.abs(np.gradient(quiet.position))[firsts] / PERIOD < 0.02)
+    np.testing.assert_allclose(angle[1:], quiet.position[firsts], atol=1.5e-3)
 
 
 def recovered(seed):
-    """Which of the fitted parameters lie in their intervals, and the latency."""
-    truth, latency = random_truth(seed)
-    found = identify(log_of(truth, seed, latency=latency), GUESS)
-    assert not found.unidentifiable
-    inside = {n: found.intervals[n][0] <= truth[n] <= found.intervals[n][1] for n in found.fitted}
-    wide = {
-        name
-        for name in found.fitted  # intervals that say nothing
-        if np.ptp(found.intervals[name]) >= 0.5 * truth[name] + 2e-3
-    }
-    return inside | {"latency": found.latency == latency}, wide
+    """Which of the fitted parameters lie in their intervals, and the latency; whose intervals say nothing."""
+    rng = np.random.default_rng(seed)
+    ranges = dict(stiffness=(2, 4), damping=(0.06, 0.15), stall_torque=(0.35, 0.45))
+    ranges |= dict(coulomb_friction=(0.005, 0.03), viscous_friction=(0.002, 0.01), dead_band=(0.002, 0.012))
+    truth = TRUTH | {name: rng.uniform(*ends) for name, ends in ranges.items()}
+    latency = int(rng.integers(5))
+    result = identify(log_of(truth, seed, latency=latency), GUESS)
+    assert not result.unidentifiable
+    inside = {n: result.intervals[n][0] <= truth[n] <= result.intervals[n][1] for n in result.fitted}
+    wide = {name for name in result.fitted if np.ptp(result.intervals[name]) >= 0.5 * truth[name] + 2e-3}
+    return inside | {"latency": result.latency == latency}, wide
 
 
 @pytest.mark.slow
 def test_parameters_come_back():
-    """One trial like those of `test_parameters_come_back_in_90_of_100`."""
     inside, wide = recovered(0)
     assert inside["latency"] and sum(inside.values()) >= 6, inside  # of 7
     assert not wide
@@ -231,38 +126,23 @@ def test_parameters_come_back_in_90_of_100():
 @pytest.mark.slow
 def test_holdout_and_report():
     holdout = log_of(TRUTH, 7, target=HOLDOUT)
-    found = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
-    assert found.holdout_rmse < 0.0013 and found.holdout_rmse_before > 0.003
-    direct = evaluate(holdout, found.values, latency=2, substeps=SUBSTEPS)
-    assert direct[0] == pytest.approx(found.holdout_rmse)
-    assert direct[1] < 0.02
-    text = found.report()
+    result = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
+    assert result.holdout_rmse < 0.0013 and result.holdout_rmse_before > 0.003
+    direct = evaluate(holdout, result.values, latency=2, substeps=SUBSTEPS)
+    assert direct[0] == pytest.approx(result.holdout_rmse) and direct[1] < 0.02
     for word in ("stiffness", "dead_band", "latency", "hold-out", "mrad"):
-        assert word in text
-    assert np.isfinite(found.condition) and found.correlation.shape == (6, 6)
-    np.testing.assert_allclose(np.diag(found.correlation), 1.0)
+        assert word in result.report()
+    np.testing.assert_allclose(np.diag(result.correlation), np.ones(6))
 
 
-@pytest.mark.slow
-def test_latency_scan_shows_its_valley():
-    log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SHORT, latency=3)
-    found = identify(log, GUESS, dead_band=None)
-    assert found.latency == 3 and found.latency_cost[3] == 0.0
-    costs = [found.latency_cost[lag] for lag in range(9)]
-    assert all(cost > 0.5 for lag, cost in enumerate(costs) if lag != 3)
-    assert found.latency_plausible == (3,)
-    late = identify(log, GUESS, dead_band=None, latencies=(0, 1, 2))
-    assert any("largest that was tried" in note for note in late.notes)
-
-
-def test_latencies_are_compared_under_the_same_weights():
-    """Less noise than the first weights say: costs from before the noise was found are too low by far."""
-    quiet = dict(position_noise=2e-4, position_resolution=0.0, with_torque=False)
-    log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SHORT, latency=3, **quiet)
-    found = identify(log, GUESS, dead_band=None)
-    assert found.latency == 3 and found.latency_plausible == (3,) and set(found.latency_cost) == set(range(9))
-    assert found.latency_cost[3] == 0.0
-    assert all(cost > 0.5 for lag, cost in found.latency_cost.items() if lag != 3), found.latency_cost
+@pytest.mark.parametrize("noise", [0.001, 2e-4])
+def test_latency_scan_shows_its_valley(noise):
+    """Also with less noise than the first weights say: costs under other weights would be too low by far."""
+    log = log_of(FREE, 3, target=SHORT, latency=3, noise=noise)
+    result = identify(log, GUESS, dead_band=None)
+    assert result.latency == 3 and result.latency_plausible == (3,) and set(result.latency_cost) == set(range(9))
+    assert result.latency_cost[3] == 0.0
+    assert all(cost > 0.5 for lag, cost in result.latency_cost.items() if lag != 3), result.latency_cost
 
 
 def c_log(truth, target, latency, timestep=5e-4, seed=0):
@@ -277,22 +157,17 @@ def c_log(truth, target, latency, timestep=5e-4, seed=0):
         forcerange="{-truth["stall_torque"]} {truth["stall_torque"]}"/></actuator></mujoco>""")
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     data.qpos[0] = data.ctrl[0] = target[0]
-    per_tick, rows = round(PERIOD / timestep), []
+    rows = []
     for tick in range(len(target)):
         mujoco.mj_forward(model, data)
         rows.append((data.qpos[0], data.actuator_force[0]))
-        for step in range(per_tick):
+        for step in range(round(PERIOD / timestep)):
             index = tick if step * timestep >= latency - 1e-9 else tick - 1
             data.ctrl[0] = target[max(index, 0)]
             mujoco.mj_step(model, data)
     position, torque = np.array(rows).T
-    return JointLog(
-        PERIOD,
-        target,
-        position + 0.001 * rng.standard_normal(len(target)),
-        torque + 0.01 * rng.standard_normal(len(target)),
-        "c_hinge",
-    )
+    errors = rng.standard_normal((2, len(target)))
+    return JointLog(PERIOD, target, position + 0.001 * errors[0], torque + 0.01 * errors[1])
 
 
 def test_c_mujocos_joint_is_identified():
@@ -301,84 +176,63 @@ def test_c_mujocos_joint_is_identified():
     truth = dict(
         stiffness=3.0, damping=0.12, stall_torque=0.4, inertia=0.012, coulomb_friction=0.03, viscous_friction=0.01
     )
-    log = c_log(truth, SHORT, latency=0.009)
     guess = dict(stiffness=2.0, damping=0.2, stall_torque=0.5, no_load_speed=1e2, inertia=0.012)
-    found = identify(log, guess, dead_band=None, substeps=5, latencies=(2, 3, 4))
-    assert found.latency == 3 and found.timestep == pytest.approx(3e-3)
-    for name, slack in (
-        ("stiffness", 0.03),
-        ("damping", 0.05),
-        ("stall_torque", 0.02),
-        ("coulomb_friction", 0.08),
-        ("viscous_friction", 0.2),
-    ):
-        assert found.values[name] == pytest.approx(truth[name], rel=slack), name
-    assert found.rmse < 0.002
+    result = identify(c_log(truth, SHORT, 0.009), guess, dead_band=None, substeps=5, latencies=(2, 3, 4))
+    assert result.latency == 3 and result.timestep == pytest.approx(3e-3) and result.rmse < 0.002
+    slack = dict(stiffness=0.03, damping=0.05, stall_torque=0.02, coulomb_friction=0.08, viscous_friction=0.2)
+    for name, share in slack.items():
+        assert result.values[name] == pytest.approx(truth[name], rel=share), name
 
 
 # --- what the data do not tell ----------------------------------------------------------------------------
 
 
-def quick(log, fit, **options):
-    options = dict(dead_band=None, latencies=(2,)) | options
-    return identify(log, options.pop("start", GUESS), fit=fit, **options)
-
-
 @pytest.fixture(scope="module")
 def smooth_log():
-    return log_of(TRUTH | {"dead_band": 0.0}, 5, target=SHORT)
+    return log_of(FREE, 5, target=SHORT)
 
 
-def group_with(found, *names):
-    return any(set(names) <= set(group) for group in found.unidentifiable)
+def quick(log, fit, start=GUESS):
+    return identify(log, start, fit=fit, dead_band=None, latencies=(2,))
+
+
+def group_with(result, *names):
+    return any(set(names) <= set(group) for group in result.unidentifiable)
 
 
 def test_efficiency_is_lost_in_the_gains(smooth_log):
-    found = quick(
-        smooth_log,
-        ("stiffness", "damping", "stall_torque", "efficiency", "coulomb_friction", "viscous_friction"),
-        start=GUESS | {"efficiency": 0.9},
-    )
-    assert group_with(found, "stiffness", "damping", "stall_torque", "efficiency")
-    assert not group_with(found, "coulomb_friction")
+    result = quick(smooth_log, (*FIT, "efficiency"), GUESS | {"efficiency": 0.9})
+    assert group_with(result, "stiffness", "damping", "stall_torque", "efficiency")
+    assert not group_with(result, "coulomb_friction")
     for name in ("stiffness", "efficiency"):
-        assert found.intervals[name][1] - found.intervals[name][0] > 0.5  # as wide as its bounds
-    assert any("keep one fixed" in note for note in found.notes)
+        assert result.intervals[name][1] - result.intervals[name][0] > 0.5  # as wide as its bounds
+    assert any("do not separate or do not show stiffness" in note for note in result.notes)
 
 
 def test_angles_alone_fix_torques_over_inertia_only(smooth_log):
     names = ("stiffness", "damping", "stall_torque", "coulomb_friction", "inertia")
-    blind = dataclasses.replace(smooth_log, torque=None)
-    found = quick(blind, names)
-    assert group_with(found, "stiffness", "inertia") and any("record the torque" in note for note in found.notes)
+    assert group_with(quick(dataclasses.replace(smooth_log, torque=None), names), "stiffness", "inertia")
     sighted = quick(smooth_log, names)
     assert not sighted.unidentifiable
     assert sighted.values["inertia"] == pytest.approx(TRUTH["inertia"], rel=0.1)
 
 
-def test_an_encoders_zero_needs_a_stop(smooth_log):
-    found = quick(smooth_log, ("stiffness", "encoder_bias"))
-    assert group_with(found, "encoder_bias") and any("against its stop" in note for note in found.notes)
-
-
-def test_a_limit_that_was_never_reached():
+def test_what_the_signals_never_show(smooth_log):
+    assert group_with(quick(smooth_log, ("stiffness", "encoder_bias")), "encoder_bias")
     gentle = joint_excitation(
         Excitation(period=PERIOD, amplitude=0.04, chirp_frequency=(0.3, 2.0), chirp_seconds=2.0), 0.9, 0.8
     )
     gentle = np.concatenate([gentle, np.full(len(SHORT), 0.9)])[: len(SHORT)]
-    found = quick(
-        log_of(TRUTH | {"dead_band": 0.0}, target=gentle),
-        ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed"),
-    )
-    for name in ("stall_torque", "no_load_speed"):
-        assert group_with(found, name)
-    assert any("larger steps" in note for note in found.notes)
+    names = ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed")
+    result = quick(log_of(FREE, target=gentle), names)
+    assert group_with(result, "stall_torque") and group_with(result, "no_load_speed")
 
 
-def test_bounds_that_were_run_into_are_reported(smooth_log):
-    found = quick(smooth_log, ("stiffness", "damping", "coulomb_friction"), bounds={"coulomb_friction": (0.0, 0.01)})
-    assert found.at_bound == ("coulomb_friction",) and any("its bound" in note for note in found.notes)
-    assert "at its bound" in found.report()
+def test_bounds_that_were_run_into_are_reported(smooth_log, monkeypatch):
+    monkeypatch.setitem(PARAMETERS, "coulomb_friction", dataclasses.replace(PARAMETERS["coulomb_friction"], high=0.01))
+    result = quick(smooth_log, ("stiffness", "damping", "coulomb_friction"))
+    assert result.at_bound == ("coulomb_friction",) and any("its bound" in note for note in result.notes)
+    assert "at its bound" in result.report()
 
 
 def test_intervals_of_a_linear_problem_are_the_textbooks():
@@ -387,11 +241,10 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
     residual = 0.1 * rng.standard_normal(400)
     one = np.zeros(400, int)
     half, correlation, condition, null = uncertainty(jacobian, residual, np.ones(3), one)
-    deviation = half / 1.96
     covariance = np.linalg.inv(jacobian.T @ jacobian) * np.sum(residual**2) / 397
-    assert np.all(deviation >= 0.999 * np.sqrt(np.diag(covariance)))
-    np.testing.assert_allclose(deviation, np.sqrt(np.diag(covariance)), rtol=0.2)
     spread = np.sqrt(np.diag(covariance))
+    assert np.all(half / 1.96 >= 0.999 * spread)
+    np.testing.assert_allclose(half / 1.96, spread, rtol=0.2)
     np.testing.assert_allclose(correlation, covariance / np.outer(spread, spread), atol=1e-9)
     assert condition == pytest.approx(np.linalg.cond(jacobian)) and not null
     twin = np.column_stack([jacobian, jacobian[:, 1]])
@@ -412,18 +265,13 @@ def test_segments_that_disagree_widen_the_intervals():
 
 def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
     """Torque that ripples by 3 % and noise that does not forget: what the segments disagree about."""
-    rng = np.random.default_rng(1)
-    log = log_of(TRUTH | {"dead_band": 0.0}, 8, target=SHORT)
-    noise = scipy.signal.lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.standard_normal((2, len(SHORT))))
-    rippled = dataclasses.replace(
-        log,
-        position=log.position + 0.001 * noise[0],
-        torque=log.torque * (1 + 0.03 * np.sin(150 * log.position)) + 0.01 * noise[1],
-    )
-    found = quick(rippled, FIT)
+    log = log_of(FREE, 8, target=SHORT)
+    white = np.random.default_rng(1).standard_normal((2, len(SHORT)))
+    noise = scipy.signal.lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], white)
+    torque = log.torque * (1 + 0.03 * np.sin(150 * log.position)) + 0.01 * noise[1]
+    result = quick(dataclasses.replace(log, position=log.position + 0.001 * noise[0], torque=torque), FIT)
     for name in FIT:
-        assert found.intervals[name][0] <= TRUTH[name] <= found.intervals[name][1], name
-    assert any("obeys this model" in note for note in found.notes)
+        assert result.intervals[name][0] <= TRUTH[name] <= result.intervals[name][1], name
 
 
 # --- refusals ----------------------------------------------------------------------------------------------
@@ -432,61 +280,35 @@ def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        (dict(target=TARGET[:100], position=TARGET[:100]), "100 samples: at least 200"),
-        (dict(position=TARGET[:-1]), "one length"),
-        (
-            dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)),
-            "position is not a number at sample 40",
-        ),
-        (dict(torque=np.full(len(TARGET), np.inf)), "torque is not a number at sample 0"),
+        (dict(target=TARGET[:100], position=TARGET[:100]), "at least 200 samples"),
+        (dict(position=TARGET[:-1]), "arrays of one length"),
+        (dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)), "not a number"),
+        (dict(torque=np.full(len(TARGET), np.inf)), "not a number"),
         (dict(period=15.0), "period of 15 s: give seconds"),
         (dict(position=np.rad2deg(TARGET), target=np.rad2deg(TARGET)), "give rad"),
-        (dict(target=TARGET / 57.3), "different units"),
-        (dict(target=0 * TARGET + 0.9), "commanded over 0 rad"),
+        (dict(target=TARGET / 57.3), "same unit"),
         (dict(position=0 * TARGET + 0.9), "moved over 0 rad"),
-        (dict(torque=0.4 * np.sign(TARGET - 0.9) + 0.0), "saturated"),
+        (dict(torque=np.where(np.arange(len(TARGET)) % 3 < 2, 0.4, 0.1)), "saturated"),
         (dict(torque=1e3 * np.sin(np.arange(len(TARGET)))), "give Nm"),
     ],
 )
 def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
     log = dataclasses.replace(JointLog(PERIOD, TARGET, TARGET + 0.01, None, "thumb_bend"), **changes)
-    if says == "saturated":
-        log = dataclasses.replace(log, torque=np.where(np.arange(len(TARGET)) % 3 < 2, 0.4, 0.1))
-    with pytest.raises(CalibrationError, match=says) as caught:
+    with pytest.raises(CalibrationError, match=f"^thumb_bend.*{says}"):
         check_log(log)
-    assert str(caught.value).startswith("thumb_bend") and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (dict(fit=("dead_band",)), "dead_band cannot be named in fit"),
-        (dict(fit=("mass",)), "mass cannot be named in fit"),
+        (dict(fit=("dead_band",)), "cannot fit 'dead_band'"),
         (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
         (dict(start={"stiffness": 3.0}), "no value for damping"),
-        (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside its bounds"),
-        (dict(bounds={"stifness": (1.0, 5.0)}), "there are no bounds of 'stifness': choose from stiffness"),
-        (dict(latencies=()), "no latencies to try"),
+        (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside"),
+        (dict(holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10])), "at least 200 samples"),
     ],
 )
 def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
     options = {"start": GUESS} | options
     with pytest.raises(CalibrationError, match=says):
         identify(smooth_log, options.pop("start"), **options)
-
-
-def test_the_holdout_is_checked_before_the_fit(smooth_log, monkeypatch):
-    monkeypatch.setattr("dexsim.identification.identify.Problem", lambda *_: pytest.fail("the fit began"))
-    with pytest.raises(CalibrationError, match="another day: 10 samples"):
-        identify(smooth_log, GUESS, holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10], None, "another day"))
-    with pytest.raises(CalibrationError, match="another day: a period of 0.03 s, that of the log to fit is 0.015 s"):
-        identify(smooth_log, GUESS, holdout=JointLog(2 * PERIOD, TARGET, TARGET, None, "another day"))
-
-
-def test_the_blurred_gradient_is_of_the_same_joint():
-    """Without a dead-band the blur changes nothing at all away from the target."""
-    log = log_of(TRUTH | {"dead_band": 0.0}, position_noise=0.0)
-    full = with_defaults(TRUTH | {"dead_band": -1.0}, log)
-    arguments = (jnp.asarray(TARGET, jnp.float32), jnp.int32(2), jnp.float32(0.005), SUBSTEPS)
-    hard, soft = (simulate(full, *arguments, blur=blur) for blur in (0.0, 2e-3))
-    np.testing.assert_allclose(hard[0], soft[0], atol=1e-4)

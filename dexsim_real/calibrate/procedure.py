@@ -1,0 +1,290 @@
+"""The press procedure: check and tare at rest, then press each fingertip on something firm, slowly.
+
+Every exchange is logged with its press and phase. `dexsim_real.calibrate.press_fit` reads the log, so an immediate fit
+and a later one give the same result.
+"""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+
+from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.person import Gauge
+from dexsim_real.calibrate.plan import Placement
+from dexsim_real.control.safety import Reaction
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind
+from dexsim_real.loop import Exchange
+from dexsim_real.sensors.taxels import taxel_names
+
+LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
+"""Phases of a press; "level K" is a force held for the gauge."""
+TOUCHED = 20.0
+"""Counts that a fingertip's sum may be off zero after a press."""
+
+_REST = 2.0  # s, recording with the motors off
+_ANSWERED = 0.5  # share of the exchanges at rest that must be answered
+_NOISY = 3.0  # counts, standard deviation at rest above which a taxel is noisy
+_DRIFT = 15.0  # counts by which a fingertip's sum may change at rest
+_SMOOTH = 10  # samples of the moving mean for the drift
+_TOUCH = 0.4  # N above which a fingertip touches
+_CLEARANCE = 0.2  # rad from the start of a press to the posture of contact
+_TRAVEL = 0.8  # rad, largest travel of a joint target past contact
+_LAST = 12  # samples at the end of a press that are averaged
+_STALL = 0.02  # share of the peak force by which the force must grow in a second, or the motors stall
+_ATTEMPTS = 3  # at a press, with nobody to ask
+_LEAST_MOTION = 0.004  # rad that each joint should move in a press
+_LEAN = (0.5, -0.5, 0.0)  # more motion of the first joints or the last: presses with different shear
+
+
+class MissedPress(HandError):
+    """A press that brought nothing and can be made again, such as one beside the pen."""
+
+
+class PressProcedure:
+    """All presses of a session.
+
+    A press advances the joint targets along a direction in joint space. The direction in which every joint moves
+    forward depends on the unpublished stiffness of the drives. It is therefore taken from the press before: the
+    distance by which each joint lagged its target, plus the same small motion for all.
+
+    Args:
+      bench: connected, motors off.
+      gauge: None when the taxels are the reference.
+    """
+
+    def __init__(self, bench: Bench, gauge: Gauge | None):
+        self.bench, self.operator, self.gauge = bench, bench.operator, gauge
+        self.config, self.hand = bench.arguments.press, bench.sensing.hand
+        self._advance = 0.0  # rad past the posture
+        self._touch = _TOUCH  # N
+
+    def check(self) -> None:
+        """Check and tare the taxels, with the motors off and nothing touching them.
+
+        Raises:
+          HandError: too few answers, something touches a fingertip, or a taxel is stuck.
+        """
+        self.operator.tell("checking the taxels: do not touch the fingertips")
+        exchanges = self.bench.collect(_REST, mark={"press": "", "phase": REST})
+        if len(exchanges) < _ANSWERED * self.bench.arguments.rate * _REST:
+            raise HandError(f"only {len(exchanges)} answers in {_REST:g} s; check the cable, or close other programs")
+        counts = np.array([self.bench.sensing.counts(exchange.state) for exchange in exchanges])
+        self.bench.set_zero(exchanges)
+        for finger, name in enumerate(self.hand.finger_names):
+            check_steady(name, counts[:, finger].sum(-1))
+            noise = counts[:, finger].std(0)
+            if np.any(noise > _NOISY):
+                which = taxel_names(self.hand, noise > _NOISY)
+                self.operator.tell(f"  {name}: noisy: {which} (up to {noise.max():.1f} counts)")
+
+    def press(self, placement: Placement) -> bool:
+        """All presses of one placement, again when they are missed; False when the user skips it.
+
+        Raises:
+          HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
+        """
+        record = dataclasses.asdict(placement)
+        for attempt in itertools.count(1):
+            self.bench.log.add(Kind.META, {"placement": record})
+            try:
+                return self._press(placement)
+            except MissedPress as missed:
+                self.bench.log.add(Kind.META, {"placement": record})  # Drops what was recorded of it.
+                if self.operator.assume_yes and attempt >= _ATTEMPTS:
+                    raise
+                self.operator.tell(f"  {missed}; again")
+        raise AssertionError("the attempts have no end")
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    def _press(self, placement: Placement) -> bool:
+        self._placement = placement
+        self._start()
+        self.operator.tell(f"{placement.name}: {placement.task}")
+        if not self.operator.assume_yes:
+            answer = self.operator.ask("  Enter presses, s skips:", lambda: self.bench.step(self._target()))
+            if answer.lower() in ("s", "skip"):
+                return False
+        self._tare_in_air()
+        self._approach()
+        speed = self.config.first_speed
+        for cycle in range(self.config.cycles):
+            self._load(speed)
+            speed = max(self._advance, 0.01) / self.config.seconds
+            self._unload(speed)
+            self._aim(_LEAN[cycle % len(_LEAN)])
+        # Typing readings takes long, so the sides use the scale of the pads.
+        if self.gauge is not None and (self.gauge.automatic or placement.name.endswith("pad")):
+            self._climb(self.gauge, speed)
+        self._back_off()
+        return True
+
+    def _start(self) -> None:
+        """Move to where the press begins: before the contact, as far as the joint ranges allow."""
+        posture, self._direction = self._placement.posture, self._placement.direction
+        joints = list(self._placement.joints)
+        ends = np.where(self._direction > 0, self.hand.joint_lower, self.hand.joint_upper)[joints]
+        room = np.min((posture[joints] - ends) / self._direction[joints])
+        self._base, self._advance = posture, -min(_CLEARANCE, float(room))
+        self.bench.move(self._target())
+
+    def _tare_in_air(self) -> None:
+        """Tare in the air where the press begins: gravity and the last press have moved the zero.
+
+        Raises:
+          HandError: the hand did not answer, something touches a fingertip, or a taxel is stuck.
+        """
+        pause, target = self.config.pause, self._target()
+        self.bench.collect(pause, target)
+        self.bench.set_zero(self.bench.collect(pause, target))
+        free = [self._force(exchange) for exchange in self.bench.collect(pause, target)]
+        self._touch = max(_TOUCH, float(np.mean(free) + 6 * np.std(free)))
+
+    def _approach(self) -> None:
+        """Advance until contact, where the advance is set to zero."""
+        name = self._placement.name
+        while True:
+            exchange = self._step(self.config.approach_speed)
+            if exchange is None:
+                continue
+            if self._force(exchange) >= self._touch:
+                break
+            if self._overloaded(exchange):
+                raise MissedPress(
+                    f"{name}: {exchange.sample.measured.current.max():.2f} A and no taxel feels it; press on the "
+                    "taxels, and check that their sensor is connected"
+                )
+            if self._advance >= _TRAVEL:
+                raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
+        self._base, self._advance = self._target(), 0.0
+
+    def _load(self, speed: float) -> None:
+        """Press until peak force, current or travel is reached, or the motors stall."""
+        assert self.bench.safety.sample is not None, "the approach has read the pose"
+        begin, first = self.bench.safety.sample.measured.joint_position.astype(float), self._target()
+        second = round(self.bench.arguments.rate)
+        forces: list[float] = []
+        positions: list[np.ndarray] = []
+        while True:
+            exchange = self._step(speed, LOADING)
+            if exchange is None:
+                forces.clear()  # After an interruption a constant force does not mean that the motors stall.
+                continue
+            forces.append(self._force(exchange))
+            positions.append(exchange.sample.measured.joint_position.astype(float))
+            if forces[-1] >= self.config.peak or self._overloaded(exchange):
+                break
+            stalled = (
+                len(forces) > 2 * second
+                and np.mean(forces[-_LAST:]) - np.mean(forces[-second - _LAST : -second]) < _STALL * self.config.peak
+            )
+            if self._advance >= _TRAVEL or stalled:
+                if forces[-1] < 4 * self._touch:
+                    raise MissedPress(
+                        f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something "
+                        "firmer, or raise --hardware.torque-max"
+                    )
+                break
+        self._held = (self._target() - first, np.mean(positions[-_LAST:], 0) - begin)
+
+    def _aim(self, lean: float) -> None:
+        """Set the direction so that every joint moves forward in the next press, the first ones by `lean` more."""
+        joints = list(self._placement.joints)
+        way, share = np.sign(self._placement.direction[joints]), np.abs(self._placement.direction[joints])
+        commanded, moved = (part[joints] * way for part in self._held)
+        motion = max(float(share @ moved / share.sum()), _LEAST_MOTION)
+        advance = np.maximum(commanded - moved, 0.0) + motion * np.linspace(1 + lean, 1 - lean, len(joints))
+        self._base, self._advance = self._target(), 0.0
+        self._direction = np.zeros(self.hand.num_joints)
+        self._direction[joints] = way * advance / advance.max()
+
+    def _unload(self, speed: float) -> None:
+        """Retract until the fingertip is almost free."""
+        while self._advance > -_CLEARANCE:
+            exchange = self._step(-speed, UNLOADING)
+            if exchange is not None and self._force(exchange) <= self._touch:
+                return
+
+    def _climb(self, gauge: Gauge, speed: float) -> None:
+        """Hold rising and falling forces, and read the gauge at each."""
+        levels, pause = self.bench.arguments.levels, self.config.pause
+        shares = np.linspace(1 / levels, 1.0, levels)
+        for number, share in enumerate([*shares, *shares[-2::-1]]):
+            self._seek(share * self.config.peak, speed if number < levels else -speed)
+            self.bench.collect(pause, self._target())
+            phase = f"level {number}"
+            mark = {"press": self._placement.name, "phase": phase}
+            held = self.bench.collect(pause, self._target(), mark)
+            mean = np.mean([self._force(exchange) for exchange in held])
+            self.operator.tell(f"  holding; the taxels read {mean:.1f} N")
+            force = gauge.read(lambda: self._step(0.0, phase))  # noqa: B023
+            if force is not None:
+                self.bench.annotate({**mark, "gauge": force})
+
+    def _seek(self, force: float, speed: float) -> None:
+        """Advance or retract until the force is passed, or a limit is reached."""
+        while True:
+            exchange = self._step(speed)
+            if exchange is None:
+                continue
+            over = (self._force(exchange) - force) * math.copysign(1.0, speed)
+            if over >= 0 or self._overloaded(exchange) or not -_CLEARANCE < self._advance < _TRAVEL:
+                return
+
+    def _back_off(self) -> None:
+        """Free the fingertip, and check that it reads about zero.
+
+        Raises:
+          MissedPress: it reads far below zero, so it was touched when it was tared.
+        """
+        self._start()
+        self.bench.collect(self.config.pause, self._target())
+        name, finger, sensing = self._placement.name, self._placement.finger, self.bench.sensing
+        exchanges = self.bench.collect(self.config.pause, self._target(), {"press": name, "phase": RELEASED})
+        sums = [(sensing.counts(exchange.state) - sensing.tare)[finger].sum() for exchange in exchanges]
+        if np.median(sums) < -TOUCHED:
+            raise MissedPress(
+                f"{name}: reads {np.median(sums):.0f} counts after the press: it was touched while it was tared; free "
+                "the fingertip"
+            )
+
+    def _step(self, speed: float, phase: str = "") -> Exchange | None:
+        """One exchange, advanced at this speed in rad/s, logged as a sample of the phase unless that is empty.
+
+        None when the hand did not answer or `Safety` held it; the advance then stays as it was.
+        """
+        before, self._advance = self._advance, min(self._advance + speed * self.bench.pace.period, _TRAVEL)
+        exchange = self.bench.step(self._target(), {} if phase else None)
+        if exchange is None or exchange.decision.reaction > Reaction.CLIP:
+            self._advance = before
+            return None
+        if phase:
+            self.bench.annotate({"press": self._placement.name, "phase": phase})
+        return exchange
+
+    def _target(self) -> np.ndarray:
+        return self._base + self._advance * self._direction
+
+    def _force(self, exchange: Exchange) -> float:
+        return float(exchange.sample.measured.finger_force[self._placement.finger])
+
+    def _overloaded(self, exchange: Exchange) -> bool:
+        return float(exchange.sample.measured.current.max()) >= self.config.current
+
+
+def check_steady(name: str, sums: np.ndarray) -> None:
+    """Check that a fingertip's sum [T] counts does not move by more than noise explains.
+
+    Raises:
+      HandError: it moves, so something touches the fingertip: lightly enough to be tared away.
+    """
+    drift = np.ptp(np.convolve(sums, np.full(_SMOOTH, 1 / _SMOOTH), "valid"))
+    usual = 6 * np.std(np.diff(sums)) / np.sqrt(2 * _SMOOTH)
+    if drift > _DRIFT + usual:
+        raise HandError(
+            f"cannot tare the taxels: the {name}'s sum moved by {drift:.0f} counts at rest: something touches it; free "
+            "the fingertip"
+        )

@@ -1,0 +1,131 @@
+"""The command: options and files."""
+
+import re
+
+import numpy as np
+import pytest
+from calibrating import arguments, operator
+from pty_hand import PtyHand
+
+from dexsim.calibration.maps import load_calibration
+from dexsim.core import cli
+from dexsim.core.errors import DexsimError
+from dexsim_real.calibrate import __main__ as calibrate
+from dexsim_real.calibrate.__main__ import fit_and_report, main
+from dexsim_real.calibrate.options import PressConfig
+from dexsim_real.calibrate.read import read_presses
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.wire.frames import Mode
+
+
+def test_options_that_do_not_go_together(tmp_path):
+    log, same = tmp_path / "a.log", tmp_path / "link" / "hand.toml"
+    (tmp_path / "link").symlink_to(tmp_path)
+    log.write_text("precious")
+    for options, says in (
+        ({"port": None}, "--port for a hand, or --from-log"),
+        ({"from_log": (log,)}, "--port for a hand, or --from-log"),
+        ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
+        ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
+        ({"joints": ("mid_joint1",)}, "--joints needs --identify"),
+        ({"dead_band": True}, "--dead-band needs --identify"),
+        ({"identify": True, "fingers": ("index",)}, "--fingers is for presses: not with --identify"),
+        ({"plot": tmp_path / "hand.abc"}, "--plot .*hand.abc: give a file that ends in .png, .pdf or .svg"),
+        ({"log": same}, "--log .*is the file of --output, too"),
+        ({"port": None, "from_log": (log,), "output": log, "force": True}, "--output .*is the --from-log"),
+        ({"output": log}, "already exists: give another --output, or --force"),
+    ):
+        with pytest.raises(DexsimError, match=says):
+            arguments(tmp_path, **options)
+
+
+@pytest.mark.slow
+def test_nothing_is_overwritten(hand, session, tmp_path):
+    options, path = arguments(tmp_path), tmp_path / "hand.toml"
+    path.write_text("precious")
+    with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(session[2]))} fits these"):
+        fit_and_report(options, hand, [session[2]], operator())  # It came while the hand was pressing.
+    assert path.read_text() == "precious"
+    fit_and_report(arguments(tmp_path, force=True), hand, [session[2]], operator())
+    assert load_calibration(path, hand).joint_names == hand.joint_names
+
+
+def test_a_figure_that_cannot_be_written_leaves_the_calibration(hand, session, tmp_path):
+    (tmp_path / "file").touch()
+    options = arguments(tmp_path, plot=tmp_path / "file" / "hand.png")
+    with pytest.raises(OSError, match="file"):
+        fit_and_report(options, hand, [session[2]], operator())
+    assert load_calibration(options.output, hand).joint_names == hand.joint_names
+
+
+def command(*options):
+    """The command in this process; its exit code."""
+    with pytest.raises(SystemExit) as stop:
+        cli.run(lambda _: main(list(options)))
+    return stop.value.code
+
+
+@pytest.mark.parametrize(
+    ("option", "path", "says"),
+    [
+        ("--plot", "file/hand.png", "error: .*file: File exists"),
+        ("--output", "file/hand.toml", "error: .*file(/hand.toml)?: (File exists|Not a directory)"),
+        ("--plot", "folder.png", "error: .*folder.png: Is a directory"),
+    ],
+)
+def test_where_nothing_can_be_written_nothing_moves(tmp_path, monkeypatch, capsys, option, path, says):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
+    touched = []
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    monkeypatch.setattr(calibrate, "record", lambda *_: touched.append("hand") or tmp_path / "no.log")
+    output = [] if option == "--output" else ["--output", str(tmp_path / "hand.toml")]
+    assert command("--port", "x", *output, option, str(tmp_path / path)) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(says, line) and not touched
+
+
+def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("serial")
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    with PtyHand() as peer:
+        peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
+        output, log = tmp_path / "hand.toml", tmp_path / "hand.log"
+        options = f"--port {peer.port} --yes --output {output} --log {log} --link.settle 0 --link.no-paced".split()
+        assert command(*options, "--no-realtime") == 2
+        assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "firmware 1.3.9" in lines[0]
+    assert lines[-1].startswith("error: cannot tare the taxels: 3 adjacent taxels of the ring read above 40 counts")
+    assert not output.exists()
+
+
+def changed(source, path, **values):
+    """A log with another configuration."""
+    with LogWriter(path) as log:
+        for entry in LogReader(source):
+            meta = entry.kind == Kind.META and "task" in entry.content
+            log.add(entry.kind, {**entry.content, **values} if meta else entry.content, entry.time)
+    return path
+
+
+def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session, tmp_path):
+    hardware = next(entry.content["hardware"] for entry in LogReader(session[2]) if entry.kind == Kind.META)
+    for values, says in (
+        ({"rate": 82.0}, "another --rate than the logs before: 82.0"),
+        ({"hardware": {**hardware, "taxel_floor": 2.0}}, "another --hardware options than the logs before"),
+        ({"serial": "2R32OTHER"}, "another hand than the logs before: .*2R32OTHER"),
+        ({"task": "grasp"}, "this is a log of 'grasp'; give one of 'calibrate'"),
+    ):
+        with pytest.raises(LogError, match=says):
+            read_presses([session[2], changed(session[2], tmp_path / f"{list(values)[0]}.log", **values)], hand)
+    for name, kind, content, says in (
+        ("early", Kind.NOTE, "end: no answer", "ends before the hand was ready"),
+        ("forged", Kind.META, {"task": "calibrate"}, "KeyError"),
+    ):
+        with LogWriter(tmp_path / f"{name}.log") as log:
+            log.add(kind, content)
+        with pytest.raises(LogError, match=says):
+            read_presses([log.path], hand)

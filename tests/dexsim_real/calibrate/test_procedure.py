@@ -1,0 +1,440 @@
+"""Whatever goes wrong while a hand is pressed turns the motors off, or the press is made again."""
+
+import dataclasses
+import io
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from types import ModuleType
+
+import numpy as np
+import pytest
+from calibrating import QUICK, arguments, off, on, operator, plates, record
+from press_bench import BenchHand
+from rich.console import Console
+
+from dexsim.calibration.maps import save_calibration
+from dexsim_real.calibrate import person
+from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.options import PressConfig
+from dexsim_real.calibrate.person import Gauge, Operator, parse_reading
+from dexsim_real.calibrate.plan import placements
+from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.procedure import PressProcedure, check_steady
+from dexsim_real.calibrate.read import read_presses
+from dexsim_real.calibrate.report import torque_constants
+from dexsim_real.control.safety import Safety
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogReader
+from dexsim_real.twin.virtual import ideal_calibration
+from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.identity import Identity
+
+
+class Interrupted(BenchHand):
+    """Something happens in the middle of the third second of pressing; from then on it may be silent."""
+
+    def __init__(self, hand, event, silent=False):
+        super().__init__(hand, plates(hand, "index pad"))
+        self.event, self.silent, self.pressing = event, silent, 0
+
+    def exchange(self, command):
+        self.pressing += self.force[1] > 0.5
+        if self.pressing == 60:
+            self.pressing += 1
+            self.event(self)
+        reply = super().exchange(command)
+        return None if self.silent and self.pressing > 60 else reply
+
+
+def raises(error):
+    def event(bench):
+        raise error
+
+    return event
+
+
+def heat(bench):
+    bench.temperature = 95
+
+
+@pytest.mark.parametrize(
+    ("event", "silent", "error", "says"),
+    [
+        (raises(KeyboardInterrupt()), False, KeyboardInterrupt, None),
+        (raises(SystemExit(143)), False, SystemExit, "143"),
+        (raises(RuntimeError("broken")), False, RuntimeError, "broken"),
+        (heat, False, HandError, r"too hot: joint thumb_bend \(thumb\), 95 degC"),
+        (lambda bench: None, True, HandError, "stopped: no measurement for 2 s"),
+    ],
+)
+def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, silent, error, says):
+    (tmp_path / "hand.toml").write_text("precious")
+    bench = Interrupted(hand, event, silent)
+    with pytest.raises(error, match=says):
+        record(bench, hand, arguments(tmp_path, force=True, press=QUICK))
+    assert on(bench).any() and off(bench) and bench.closed
+    assert (tmp_path / "hand.toml").read_text() == "precious"
+    ends = [entry.content for entry in LogReader(tmp_path / "hand.log") if entry.kind == Kind.END]
+    assert len(ends) == 1 and ends[0]["end"]
+
+
+@pytest.mark.parametrize("engaged", [False, True])
+def test_a_hand_that_never_answers_ends_a_loop_whether_its_motors_are_on_or_not(hand, tmp_path, engaged):
+    """Also where nothing waits for a number of answers: two seconds of silence are the end of it."""
+    port = BenchHand(hand, [])
+    port.exchange = lambda command: None
+    bench = Bench(arguments(tmp_path), hand, operator(), "calibrate", port=port, clock=port.clock, sleep=port.sleep)
+    if engaged:
+        bench.safety.engage()
+    with bench, pytest.raises(HandError, match="stopped: .* for 2 s"):
+        bench.collect(3.0)
+    assert 2.0 < port.time < 2.2 and port.closed
+
+
+@pytest.mark.parametrize("silent", [0.0, 0.25], ids=["at once", "after its first part"])
+def test_a_hand_that_is_silent_while_it_is_tared_ends_it(hand, tmp_path, monkeypatch, silent):
+    bench, tare, since = BenchHand(hand, plates(hand, "index pad")), PressProcedure._tare_in_air, [np.inf]
+    exchange = bench.exchange
+
+    def answer(command):
+        reply = exchange(command)
+        return None if since[0] <= reply.sent < since[0] + 1.0 else reply
+
+    def begin(procedure):
+        since[0] = bench.time + silent
+        tare(procedure)
+
+    bench.exchange = answer
+    monkeypatch.setattr(PressProcedure, "_tare_in_air", begin)
+    with pytest.raises(HandError, match="no usable answer in 0.2 s; check the cable"):
+        record(bench, hand, arguments(tmp_path, press=QUICK, sides=False))
+    assert on(bench).any() and off(bench) and bench.closed
+
+
+# --- a signal at the worst moment ------------------------------------------------------------
+
+
+class Broken(BenchHand):
+    """The procedure fails early in its first press; `stopped` is called at the first command to turn the motors off."""
+
+    def __init__(self, hand, stopped=lambda: None):
+        super().__init__(hand, plates(hand, "index pad"))
+        self.stopped, self.presses, self.was_on = stopped, 0, False
+
+    def exchange(self, command):
+        on = bool(np.all(command["mode"] == Mode.POSITION))
+        if self.was_on and not on:
+            self.was_on = False
+            self.stopped()
+        self.was_on |= on
+        self.presses += self.force[1] > 0.5
+        if self.presses == 5:
+            self.presses += 1
+            raise RuntimeError("broken")
+        return super().exchange(command)
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)  # The interpreter handles it here.
+
+
+def test_a_signal_just_before_the_motors_go_off_does_not_keep_them_on(hand, tmp_path, monkeypatch):
+    close, calls = Bench.close, []
+
+    def interrupted(loop):
+        calls.append(loop.driven)
+        if len(calls) == 1:
+            interrupt()
+        close(loop)
+
+    monkeypatch.setattr(Bench, "close", interrupted)
+    bench = Broken(hand)
+    with pytest.raises(KeyboardInterrupt):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert calls == [True, True] and on(bench).any() and off(bench) and bench.closed
+
+
+def test_a_signal_while_the_motors_go_off_is_ignored(hand, tmp_path):
+    calls = []
+    bench = Broken(hand, lambda: calls.append(interrupt()))
+    with pytest.raises(RuntimeError, match="broken"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert len(calls) == 1 and on(bench).any() and off(bench) and bench.closed
+
+
+# --- presses that are made again --------------------------------------------------------------
+
+
+class Helper(Operator):
+    """Holds the pen beside the finger until it is told so often that the press was missed."""
+
+    def __init__(self, bench, misses, **options):
+        super().__init__(Console(file=io.StringIO(), width=200), **options)
+        self.bench, self.misses, self.told, self.plates = bench, misses, 0, bench.plates
+        bench.plates = []
+
+    def tell(self, text):
+        super().tell(text)
+        if text.endswith("again"):
+            self.told += 1
+        elif text.startswith("index pad"):  # The finger is back where it begins.
+            self.bench.plates = self.plates if self.told == self.misses else []
+
+
+def test_a_missed_pen_is_pressed_again(hand, tmp_path):
+    """Twice beside it, then the press is as good as any; three times with nobody to ask end it; s skips it."""
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    helper = Helper(bench, 2, assume_yes=True)
+    options = arguments(tmp_path, press=QUICK, sides=False, log=tmp_path / "a.log")
+    (recording,) = read_presses([record(bench, hand, options, helper)], hand).recordings.values()
+    assert helper.told == 2 and np.max(recording.shown) > 60 and off(bench)
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    helper = Helper(bench, 3, assume_yes=True)
+    with pytest.raises(HandError, match="index pad: met nothing within"):
+        record(bench, hand, dataclasses.replace(options, log=tmp_path / "b.log"), helper)
+    assert helper.told == 2 and off(bench)
+    helper = Helper(BenchHand(hand, plates(hand, "index pad")), 9, stream=io.StringIO("\n\ns\n"))
+    options = dataclasses.replace(options, yes=False, log=tmp_path / "c.log")
+    (recording,) = read_presses([record(helper.bench, hand, options, helper)], hand).recordings.values()
+    assert helper.told == 2 and not recording.time and off(helper.bench) and helper.bench.closed
+
+
+def test_a_press_that_no_taxel_feels_ends_at_its_current(hand, tmp_path):
+    numb = BenchHand(hand, plates(hand, "index pad"), taxel_gain=[1, 0, 1, 1, 1])
+    options = arguments(tmp_path, press=PressConfig(current=0.8, approach_speed=0.5))
+    with pytest.raises(HandError, match="index pad: 0.8.* A and no taxel feels it"):
+        record(numb, hand, options)
+    assert off(numb)
+
+
+@pytest.mark.slow
+def test_motors_that_give_no_more_turn_round(hand, tmp_path):
+    """A current limit far below what 8 N need: the press ends where the force ends."""
+    hardware = dataclasses.replace(arguments(tmp_path).hardware, torque_max=90)  # 0.45 A on the bench
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    log = record(bench, hand, arguments(tmp_path, hardware=hardware, sides=False))
+    calibration = fit(read_presses([log], hand), hand).calibration
+    # As much as the joint gives by itself, or, pushed by the other one, as much as it holds.
+    gives, holds = (
+        (0.45 - 0.02) * bench.constant[4] * part / bench.plates[0].arms[4]
+        for part in (bench.efficiency[4], 1.15 / bench.back[4])
+    )
+    assert gives < calibration.real.force_max[4] < holds < 7
+    truth = bench.constant[4] * bench.efficiency[4]
+    assert -torque_constants(calibration)[0, 4] == pytest.approx(truth, rel=0.05)
+
+
+class Squeezed(BenchHand):
+    """Somebody squeezes the ring finger with 20 N for half a second when the index is first pressed with 3 N."""
+
+    def __init__(self, hand):
+        super().__init__(hand, plates(hand, "index pad"))
+        self.since, self.squeezed = None, []  # numbers of the exchanges before which the hand reported it
+
+    def exchange(self, command):
+        if self.touched.any():
+            self.squeezed.append(self.sequence + 1)
+        if self.since is None and self.force[1] > 3.0:
+            self.since = self.time
+        self.touched[3, 40:60] = 1.0 if self.since is not None and self.time < self.since + 0.5 else 0.0
+        return super().exchange(command)
+
+
+def test_a_press_waits_while_safety_holds_the_hand(hand, tmp_path, monkeypatch):
+    """Its target stays where it is, none of the samples is one of the press, and then the press continues."""
+    bench, targets, set_target = Squeezed(hand), {}, Safety.set_target
+
+    def spy(safety, position, *rest):
+        targets[bench.sequence + 1] = np.array(position)
+        set_target(safety, position, *rest)
+
+    monkeypatch.setattr(Safety, "set_target", spy)
+    log = record(bench, hand, arguments(tmp_path, press=QUICK, sides=False))
+    entries, held = list(LogReader(log)), bench.squeezed
+    assert len(held) > 20 and "hold: the fingertip force is too high" in [entry.content for entry in entries]
+    moved = [targets[number + 1] - targets[number] for number in range(held[0] - 2, held[-1] + 3)]
+    # Two steps before the hold's first request, none until the first request after it, and two more.
+    for step in (moved[1], *moved[-2:]):
+        np.testing.assert_allclose(step, moved[0], atol=1e-9)
+    assert moved[0][4] > 0 and not np.any(moved[2:-2])
+    marks = [entry.content for entry in entries if entry.kind == Kind.TICK]
+    loading = {mark["sequence"] for mark in marks if mark.get("phase") == "loading"}
+    assert {held[0] - 1, held[-1] + 1} < loading and not set(held) & loading
+
+
+def test_a_finger_tared_under_load_is_found_out(hand, tmp_path):
+    """Somebody holds the index when it is tared, too lightly to be seen, and lets go during the press: again."""
+    bench, who = BenchHand(hand, plates(hand, "index pad")), operator()
+    bench.touched[1, 30:60] = 0.3
+    exchange, let_go_at = bench.exchange, []
+
+    def let_go(command):
+        if bench.force[1] > 1.0 and bench.touched.any():
+            bench.touched[:] = 0
+            let_go_at.append(bench.time)
+        return exchange(command)
+
+    bench.exchange = let_go
+    log = record(bench, hand, arguments(tmp_path, press=QUICK, sides=False), who)
+    said = who.console.file.getvalue()
+    assert re.search(r"index pad: reads -\d+ counts .* it was touched while it was tared; .*; again", said)
+    (recording,) = read_presses([log], hand).recordings.values()
+    assert recording.time[0] > let_go_at[0] + 1.0 and len(recording.time) > 50
+
+
+# --- before the motors come on ---------------------------------------------------------------
+
+
+def test_a_touched_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    bench.touched[2, [40, 41, 52, 53]] = 6.0
+    with pytest.raises(HandError, match="of the middle .* free the fingertips"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert not on(bench).any() and bench.closed and not (tmp_path / "hand.toml").exists()
+
+
+def test_a_light_touch_shows_by_its_changes():
+    rng = np.random.default_rng(0)
+    steady = 40 + np.round(2 * rng.standard_normal(160))
+    check_steady("ring", steady)
+    with pytest.raises(HandError, match="ring's sum moved by .* touches it"):
+        check_steady("ring", steady + np.round(20 * np.sin(np.arange(160) / 25)))
+
+
+@pytest.mark.parametrize(
+    ("identity", "serial", "says"),
+    [
+        (Identity("2L32A", "left"), "", "this is a left hand"),
+        (Identity("2R32A", "right"), "2R32B", "this is hand 2R32A, the calibration is of hand 2R32B"),
+    ],
+)
+def test_another_hand_is_refused(hand, tmp_path, identity, serial, says):
+    save_calibration(tmp_path / "known.toml", dataclasses.replace(ideal_calibration(hand), serial=serial))
+    port = BenchHand(hand, [])
+    port.identity = identity
+    options = arguments(tmp_path, calibration=tmp_path / "known.toml", identify=True)
+    with pytest.raises(HandError, match=says):
+        Bench(options, hand, operator(), "identify", port=port, clock=port.clock, sleep=port.sleep).__enter__()
+    assert port.closed and not on(port).any()
+
+
+# --- the person and the gauge ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(""), None], ids=["at its end", "closed"])
+def test_nobody_at_the_terminal(hand, tmp_path, monkeypatch, stream):
+    monkeypatch.setattr(sys, "stdin", None)  # As Python has it after `<&-`.
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    who = Operator(Console(file=io.StringIO()), stream=stream)
+    with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
+        record(bench, hand, arguments(tmp_path, yes=False, press=QUICK), who)
+    assert off(bench) and bench.closed
+
+
+class Terminal:
+    """One line is typed, then Ctrl-D, or the terminal hangs up."""
+
+    def __init__(self, end):
+        self.lines, self.end = ["\n"], end
+
+    def isatty(self):
+        return True
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        if self.lines:
+            return self.lines.pop()
+        raise self.end
+
+
+@pytest.mark.parametrize("end", [StopIteration(), OSError(5, "hung up")])
+def test_the_end_of_the_input_between_two_questions_is_the_end_of_the_second(end):
+    who = Operator(Console(file=io.StringIO()), stream=Terminal(end))
+    assert who.ask("Enter presses", lambda: time.sleep(0.001)) == ""
+    who._reader.join(5.0)
+    for _ in range(2):
+        with pytest.raises(HandError, match="nobody can answer: standard input is closed"):
+            who.ask("Enter presses", lambda: time.sleep(0.001))
+
+
+@pytest.mark.parametrize(
+    ("text", "newtons"),
+    [("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)],
+)
+def test_readings_of_a_gauge(text, newtons):
+    assert parse_reading(text) == pytest.approx(newtons)
+
+
+@pytest.mark.parametrize("text", ["", "five", "5 lb", "-3", "1e3", "nan", "530", "5.2.1"])
+def test_what_is_no_reading(text):
+    with pytest.raises(HandError, match="not a reading|grams need a g"):
+        parse_reading(text)
+
+
+def gauge_of(monkeypatch, function):
+    module = ModuleType("gauge_of_user")
+    module.read = function
+    monkeypatch.setitem(sys.modules, "gauge_of_user", module)
+    return "gauge_of_user:read"
+
+
+def test_the_hand_goes_on_while_a_slow_gauge_answers(hand, tmp_path, monkeypatch):
+    bench, readings = BenchHand(hand, plates(hand, "index pad")), []
+
+    def slow():
+        begin = len(bench.commands)
+        while len(bench.commands) < begin + 20:
+            time.sleep(0.001)
+        readings.append(len(bench.commands) - begin)
+        return float(bench.force[1])
+
+    options = arguments(tmp_path, gauge=gauge_of(monkeypatch, slow), levels=5, sides=False, press=QUICK)
+    log = record(bench, hand, options)
+    assert len(readings) == 9 and min(readings) >= 20
+    assert np.sum(np.diff(on(bench).astype(int)) < 0) == 1 and off(bench)  # The motors go off once, at the end.
+    assert len(read_presses([log], hand).recordings["index pad"].gauge) == 9
+
+
+def test_a_gauge_that_hangs_or_fails_ends_it_in_one_line(monkeypatch):
+    def fail():
+        raise ConnectionError("scale unplugged")
+
+    hang, calls = threading.Event(), []
+    monkeypatch.setattr(person, "_SLOWEST", 0.2)
+    for function, says in (
+        (fail, r"the function of --gauge failed \(ConnectionError: scale unplugged\)"),
+        (lambda: sys.exit(3), r"failed \(SystemExit: 3\)"),
+        (lambda: None, r"failed \(TypeError: float"),
+        (lambda: float("nan"), "returned nan, but a fingertip presses with less than 100 N"),
+        (lambda: 530.0, "returned 530, but"),
+        (hang.wait, "did not return in time"),
+    ):
+        with pytest.raises(HandError, match=says):
+            Gauge(gauge_of(monkeypatch, function), operator()).read(lambda: calls.append(time.sleep(0.01)))
+    hang.set()
+    assert calls
+    for source, says in (("no_such_module:f", "no_such_module"), ("ask", "--gauge ask needs answers")):
+        with pytest.raises(HandError, match=says):
+            Gauge(source, operator())
+
+
+def test_a_level_that_the_current_does_not_allow_is_not_sought_beyond_it(hand, tmp_path):
+    """`_seek` is alone between the gauge's levels: the taxels may read too low, and then only the current ends it."""
+    port = BenchHand(hand, plates(hand, "index pad"), taxel_gain=[1, 0, 1, 1, 1])
+    options = arguments(tmp_path, press=PressConfig(current=0.8))
+    with Bench(options, hand, operator(), "calibrate", port=port, clock=port.clock, sleep=port.sleep) as bench:
+        procedure = PressProcedure(bench, None)
+        procedure.check()
+        bench.await_motors()
+        procedure._placement = next(p for p in placements(hand) if p.name == "index pad")
+        procedure._start()
+        procedure._seek(2.0, 0.3)
+        current = np.abs(port.current).max()
+    assert current == pytest.approx(0.8, abs=0.05) and procedure._advance < 0.8
