@@ -15,9 +15,10 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
+from dexsim_real.twin.plant.hand_model import PREFIX, own_model
 from dexsim_real.twin.plant.parameters import sample_trial
-from dexsim_real.twin.plant.scene import _place
 from dexsim_real.twin.plant.scene import build_scene as emulated_scene
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
 PAD = '<geom name="index_pad" class="pad" type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"/>'
@@ -70,13 +71,11 @@ def test_links_are_in_the_palm_frame_however_the_file_places_the_palm(tmp_path, 
     np.testing.assert_allclose(found.body_position, data.xpos[bodies], atol=1e-6)
     np.testing.assert_allclose(found.body_rotation, data.xmat[bodies].reshape(-1, 3, 3), atol=1e-5)
     # The emulated hand, which shares no code with this one.
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    _place(spec, hand.palm)
-    other = spec.compile()
+    other = own_model(hand).spec.compile()
     data = mujoco.MjData(other)
     mujoco.mj_kinematics(other, data)
-    palm = data.body(hand.palm)
-    np.testing.assert_allclose(np.append(palm.xpos, palm.xquat), [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
+    palm = data.body(PREFIX + hand.palm)
+    np.testing.assert_allclose(np.append(palm.xpos, palm.xmat), [0, 0, 0, *np.eye(3).flat], atol=1e-9)
 
 
 def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
@@ -155,7 +154,8 @@ def test_options_of_the_file_do_not_reach_the_emulated_hands_scene(tmp_path):
     hand = load_hand(rewrite(tmp_path, ("<worldbody>", flags)))
     parameters = sample_trial("grasp", np.random.default_rng(0), "nominal")
     off = mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model = emulated_scene(hand, parameters, None, np.array([9.81, 0.0, 0.0])).model
+    ball = ObjectShape("sphere", (Primitive("sphere", (0.03,)),))
+    model = emulated_scene(own_model(hand), parameters, ball, np.array([9.81, 0.0, 0.0])).model
     assert not model.opt.disableflags & off and not model.opt.enableflags and model.opt.tolerance < 1e-6
 
 
