@@ -195,7 +195,7 @@ def _whole(low: int) -> Any:
 
 def _pair(text: str) -> tuple[str, float | str]:
     name, equals, value = text.partition("=")
-    if not name or not equals:
+    if not name or not equals or value == "nan":
         raise argparse.ArgumentTypeError(f"{text}: give NAME=VALUE")
     return name, value if value in KINDS else float(value)
 

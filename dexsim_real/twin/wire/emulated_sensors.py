@@ -10,9 +10,10 @@ import socket
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.camera import CameraConfig, encode_mask
+from dexsim_real.sensors.camera import CameraConfig, camera_axes, encode_mask
 from dexsim_real.sensors.imu import UPRIGHT_X, encode, multiply
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.plant.shapes import Primitive, matrix, turn
@@ -65,40 +66,26 @@ def outline(part: Primitive) -> np.ndarray:
     return points + part.place
 
 
-def silhouette(parts: list[np.ndarray], optics: CameraConfig, size: tuple[int, int] = PICTURE) -> np.ndarray:
+def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:
     """The mask [rows, columns], bool, of convex bodies.
 
     Args:
       parts: points [N, 3] m of each body, palm frame. Bodies that extend behind the camera are not seen.
       optics: the camera.
-      size: columns and rows.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
-    mask = np.zeros((size[1], size[0]), bool)
-    forward = np.asarray(optics.forward) / np.linalg.norm(optics.forward)
-    right = np.cross(optics.down, forward)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])
+    mask = np.zeros(PICTURE[::-1], bool)
     for points in parts:
-        x, y, depth = axes @ (points - optics.position).T
+        x, y, depth = camera_axes(optics) @ (points - optics.position).T
         if depth.min() < 1e-3:
             continue
         pixels = np.stack([x / depth, y / depth], 1) * optics.focal + optics.centre
+        low = np.clip(np.floor(pixels.min(0)), 0, PICTURE).astype(int)
+        high = np.clip(np.ceil(pixels.max(0)) + 1, 0, PICTURE).astype(int)
+        grid = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1)
         with contextlib.suppress(QhullError):  # A body that projects to a line covers no pixel.
-            _fill(mask, pixels, ConvexHull(pixels).equations)
+            sides = ConvexHull(pixels).equations  # a x + b y + c <= 0 inside
+            mask[low[1] : high[1], low[0] : high[0]] |= (grid @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
     return mask
-
-
-def _fill(mask: np.ndarray, pixels: np.ndarray, sides: np.ndarray) -> None:
-    """Set the pixels whose centres are inside a convex polygon with sides a x + b y + c <= 0."""
-    low = np.clip(np.floor(pixels.min(0)).astype(int), 0, mask.shape[::-1])
-    high = np.clip(np.ceil(pixels.max(0)).astype(int) + 1, 0, mask.shape[::-1])
-    columns, rows = np.arange(low[0], high[0]), np.arange(low[1], high[1])
-    inside = np.ones((len(rows), len(columns)), bool)
-    for a, b, c in sides:
-        inside &= a * columns + (b * rows + c)[:, None] <= 0
-    mask[low[1] : high[1], low[0] : high[0]] |= inside
 
 
 # --- in real time --------------------------------------------------------------------------------
@@ -145,7 +132,6 @@ class EmulatedCamera:
     def __init__(self, path: Path, plant: Plant, *, seed: int, start: float):
         self.path, self.due, self.sent = path, start, 0
         self._plant, self._rng = plant, np.random.default_rng(seed)
-        picture(plant, CameraConfig())  # Imports SciPy now, not during the first exchange.
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:
