@@ -146,6 +146,8 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     return quat
 
 
-def make(arguments, hand) -> PressBench:
-    """In place of `dexsim_real.twin.__main__.make_plant`."""
-    return PressBench(hand, arguments.seed, arguments.parameters)
+if __name__ == "__main__":  # The emulated hand's command, on the press bench.
+    from dexsim_real.twin import __main__ as command
+
+    command.make_plant = lambda arguments, hand: PressBench(hand, arguments.seed, arguments.parameters)
+    command.main()

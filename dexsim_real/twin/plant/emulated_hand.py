@@ -207,7 +207,7 @@ class EmulatedHand:
             raise HandError(f"trial {self.trial}: none of {_OBJECTS} objects had room in the hand's start posture")
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
-        self._referee, self._hottest = Referee(self.task, self._seconds), 0.0
+        self._referee = Referee(self.task, self._seconds)
         self._look_every = max(round(_LOOK / self._period), 1)
         put(scene, self._data, self._assistant.shelf(place), place.quat)
         mujoco.mj_forward(scene.model, self._data)
@@ -245,7 +245,6 @@ class EmulatedHand:
             "plant": self._model.name,
             "shape": self.shape.name,
             "stage": self.stage.value,
-            "hottest": round(self._hottest, 2),
             **self._referee.report(),
             "parameters": {
                 name: np.round(value, 6).tolist()
@@ -304,7 +303,6 @@ class EmulatedHand:
             data.qvel[scene.drive_dof],
             self._drives.at_limit(),
         )
-        self._hottest = max(self._hottest, float(self._drives.case.max()))
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
             self._referee.end = "dropped: the physics failed"
         if self._referee.end:

@@ -137,6 +137,7 @@ def _add_drives(spec: mujoco.MjSpec, hand: HandModel, parameters: TrialParameter
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=drive.axis,
             pos=drive.pos,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
             range=[-1, 1],  # set in `_set_springs`: here its unit would be that of the file
             armature=parameters.gear_inertia,
             damping=[2e-4, 0.0, 0.0],

@@ -1,7 +1,6 @@
 """The calibration command on the emulated hand."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -18,13 +17,6 @@ from dexsim.calibration.maps import load_calibration
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.report import torque_constants
-
-ON_A_PRESS_BENCH = """
-import press_plant
-from dexsim_real.twin import __main__ as command
-command.make_plant = press_plant.make
-command.main()
-"""
 
 
 def torque_of(plant, joint):
@@ -72,10 +64,7 @@ def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
     twin = subprocess.Popen(
         [
             sys.executable,
-            "-c",
-            ON_A_PRESS_BENCH,
-            "--task",
-            "grasp",
+            str(ROOT / "tests" / "support" / "press_plant.py"),
             "--link",
             str(tmp_path / "port"),
             "--parameters",
@@ -84,7 +73,6 @@ def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
             str(tmp_path / "truth.json"),
         ],
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'support'}"},
     )
     try:
         until = time.monotonic() + 60
