@@ -46,6 +46,6 @@ def free(plant, position, quat=(1.0, 0.0, 0.0, 0.0), *, judged=False):
     """Let go of the object anywhere; unless judged, no referee calls that a drop."""
     plant._assistant.stage = Stage.FREE
     if not judged:
-        plant._after = lambda: None
+        plant._look = lambda: None
     put(plant._scene, plant._data, np.asarray(position, float), np.asarray(quat, float))
     mujoco.mj_forward(plant._scene.model, plant._data)

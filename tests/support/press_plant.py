@@ -20,7 +20,6 @@ _RADIUS = 0.006  # m
 PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
 _AWAY = np.array([0.4, 0.0, 0.0])
 _TOLERANCE = 0.015  # rad, largest distance of targets from the path of a placement
-_LOOK = 10  # periods between two looks at what the hand is about to do
 _STIFFNESS, _SHEAR = 1000.0, 400.0  # N/m of the foam along its normal and across it
 _GAP = 0.002  # m between fingertip and pen at the posture of contact
 _TURN = 0.5  # Nm/rad, rotational stiffness of the foam
@@ -80,10 +79,10 @@ class PressBench(EmulatedHand):
         wrench[:3], wrench[3:] = force - mass * self._gravity, matrix(data.qpos[at + 3 : at + 7]) @ torque
         self._spring = force
 
-    def _after(self) -> None:
+    def _look(self) -> None:
         """Hold the pen in front of the fingertip that is about to press."""
         commands = self._commands
-        if self._touches or self._ticks % _LOOK:
+        if self._touches:
             return
         if commands is None or not np.all(commands.mode == Mode.POSITION):
             self._remove()

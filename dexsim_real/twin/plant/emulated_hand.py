@@ -35,7 +35,7 @@ from dexsim_real.wire.frames import Mode
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
 _MEMORY = 0.2  # s, longest delay of a sensor
 PALM_FACE = 0.020  # m, x of the emulated hand's palm
-_LOOK = 0.01  # s between two updates of the referee
+_LOOK = 0.01  # s between two samples of the fingertips, and updates of the referee
 _OBJECTS = 200  # sampled for a trial, until one has room between the fingers
 
 
@@ -116,10 +116,9 @@ class EmulatedHand:
             self._ticks += 1
             self.time = self._ticks * self._period
             self._remember()
-            if self.time >= self._next_sample - 1e-9:
-                self._next_sample += self.parameters.taxel_period
+            if self._ticks % self._look_every == 0:
                 self._sample_skin()
-            self._after()
+                self._look()
 
     def measure(self) -> PlantMeasurement:
         """Readings of the hand's sensors, each with its delay."""
@@ -208,7 +207,6 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._referee = Referee(self.task, self._seconds)
-        self._look_every = max(round(_LOOK / self._period), 1)
         put(scene, self._data, self._assistant.shelf(place), place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -224,16 +222,16 @@ class EmulatedHand:
         self._scene, self._data, step = scene, mujoco.MjData(scene.model), scene.model.opt.timestep
         self._substeps = max(round(PERIOD / step), 1)
         self._period = self._substeps * step
+        self._look_every = max(round(_LOOK / self._period), 1)
         self._noise, self._object_noise = rng.spawn(2)
         self._drives.configure(self.parameters)
         self._skin.configure(self.parameters, rng)
         self._data.qpos[scene.drive_qpos] = self._joints
-        self._began = self._next_sample = self.time
+        self._began = self.time
         self._touches: list[TipContact] = []
         self._no_force = np.zeros((*self.hand.taxel_position.shape[:2], 3))
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / self._period))
-        samples = round(_MEMORY / self.parameters.taxel_period) + 2
-        self._samples: collections.deque[tuple[float, np.ndarray]] = collections.deque(maxlen=samples)
+        self._samples = collections.deque([(self.time, self._no_force)], maxlen=round(_MEMORY / _LOOK) + 2)
 
     def _report(self) -> dict[str, Any]:
         left_out = STRUCTURE.keys() | (OF_THE_FILE if self._model.foreign else set())
@@ -282,18 +280,17 @@ class EmulatedHand:
         acceleration = data.qacc[dof : dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
         self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
 
-    def _after(self) -> None:
-        if self._ticks % self._look_every == 0 and not self._finished:
-            if self.stage is Stage.FREE:
-                self._judge()
-            else:
-                self._assist()
+    def _look(self) -> None:
+        if self.stage is Stage.FREE:
+            self._judge()
+        elif not self._finished:
+            self._assist()
 
     def _judge(self) -> None:
         scene, data, dof, at = self._scene, self._data, self._scene.object_dof, self._scene.object_qpos
         quat = data.qpos[at + 3 : at + 7].copy()
-        force, normal = tip_forces(tip_contacts(scene, data), self.hand.num_fingers)
-        taxels = self._samples[-1][1][..., 2].sum(-1) if self._samples else np.zeros(self.hand.num_fingers)
+        force, normal = tip_forces(self._touches, self.hand.num_fingers)
+        taxels = self._samples[-1][1][..., 2].sum(-1)
         self._referee.watch(
             self._look_every * self._period,
             data.qpos[at : at + 3].copy(),

@@ -138,7 +138,6 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
     "taxel_spread": 0.08,  # standard deviation of the gains
     "taxel_threshold": 0.06,  # N
     "taxel_crosstalk": 0.06,  # share of a taxel's force that spreads to its neighbours
-    "taxel_period": 0.01,  # s between two samples of a fingertip
     "camera_noise": 0.0025,  # m, white noise of the object's position after segmentation
     "camera_delay": 0.03,  # s from a picture to its mask
     "imu_noise": 0.01,  # rad, white noise
