@@ -4,6 +4,7 @@ For `dexsim_real.calibrate`, with the drives, gears and taxels of the trials; `t
 is across the finger on a block of foam, which yields along its normal and, more softly, across it.
 """
 
+import copy
 from typing import Any
 
 import mujoco
@@ -33,7 +34,9 @@ class PressBench(EmulatedHand):
     def __init__(self, hand, seed=0, kind="outside"):
         super().__init__(hand, "grasp", seed, kind=kind, overrides=_SOLID)
         self._plan, self._assistant.stage = placements(hand), Stage.FREE
+        skin, noise = copy.copy(self._skin), self._noise
         self._enter(self._draw(self.parameters, PEN), np.random.default_rng(seed))
+        self._skin, self._noise = skin, noise  # It is still the hand of the first trial.
         self._probe = mujoco.MjData(self._scene.model)
         self._pressing_placement: Placement | None = None
         self._remove()
