@@ -60,15 +60,14 @@ def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """One trial: the referee's report, with the bridge's measurements as `bridge`."""
-    from dexsim_real.twin.plant.foreign.hand import hand_of
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
-    from dexsim_real.twin.virtual import RunOptions, VirtualRun
+    from dexsim_real.twin.virtual import VirtualRun
 
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
     hand, controller, calibration = load(options["policy"], options.get("idle", False))
-    plant = hand_of(
-        options.get("plant_model"),
+    plant = EmulatedHand(
         hand,
         options["task"],
         seed,
@@ -78,9 +77,10 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         trials=1,
         first=number,
         shape=shape,
+        plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
-    run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
+    run = VirtualRun(plant, controller, calibration, command, limits, safety=options["safety"])
     if options["task"] == "grasp":
         run.trace = []
     report = run.run()
@@ -155,7 +155,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--seed", type=_whole(0), nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")
     add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside training's ranges, or in")
-    add("--plant-model", metavar="FILE", help="MJCF of another hand in place of the emulated one (docs/hardware.md)")
+    add("--plant-model", metavar="FILE", help="MJCF of another hand (docs/emulated_hand.md)")
     add(
         "--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter: a number or kind"
     )
@@ -195,7 +195,7 @@ def _whole(low: int) -> Any:
 
 def _pair(text: str) -> tuple[str, float | str]:
     name, equals, value = text.partition("=")
-    if not name or not equals:
+    if not name or not equals or value == "nan":
         raise argparse.ArgumentTypeError(f"{text}: give NAME=VALUE")
     return name, value if value in KINDS else float(value)
 

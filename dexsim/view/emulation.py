@@ -1,6 +1,5 @@
 """The emulated hand with a policy, in virtual time: true poses, and touch as the bridge measures it."""
 
-import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,11 +11,10 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import check_wire
-from dexsim_real.twin.__main__ import check_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
-from dexsim_real.twin.virtual import RunOptions, VirtualRun, ideal_calibration
+from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
 
 
 class Emulation:
@@ -37,7 +35,6 @@ class Emulation:
         self.hand = policy.find_hand(hand) or load_hand()
         if policy.task not in TASKS:
             raise HandError(f"{name}: the emulated hand has the tasks {' and '.join(TASKS)}, not {policy.task!r}")
-        check_policy(name, policy.task, hand)
         check_wire(self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
@@ -51,24 +48,24 @@ class Emulation:
     def reset(self, values: Values) -> Frame:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.camera, self._seed, trials=1, first=self._trial)
-        self._run = VirtualRun(plant, self._controller, self._calibration, RunOptions(values.get("command", 0.5)))
+        self._run = VirtualRun(plant, self._controller, self._calibration)
         self._ticks: Iterator[None] = self._run.ticking()
         return self.step(values)
 
     def step(self, values: Values) -> Frame:
-        run = self._run
-        run.options = dataclasses.replace(run.options, command=values.get("command", 0.5))
+        self._run.policy.command = values.get("command", 0.5)
         if next(self._ticks, "over") == "over":
             return self.reset(values)
         return self._frame()
 
     def _frame(self) -> Frame:
-        plant, now = self._run.plant, self._run.now
+        plant, policy, sample = self._run.plant, self._run.policy, self._run.safety.sample
+        assert sample is not None, "the policy has ticked"
         joints, position, quat = plant.true_pose()
         parts = plant.shape.parts
-        goals, measured = self._run.goals, self._run.measured()
+        goals, measured = policy.goals, sample.measured
         finger_force = self._controller.spec.finger_force
-        target = np.nan if finger_force is None else np.interp(self._run.options.command, (0, 1), finger_force)
+        target = np.nan if finger_force is None else np.interp(policy.command, (0, 1), finger_force)
         snapshot = Snapshot(
             joint_position=joints,
             object_position=position,
@@ -78,11 +75,11 @@ class Emulation:
             primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
             primitive_active=np.ones(len(parts), bool),
             taxel_force=measured.taxel_force,
-            command=np.array(self._run.options.command),
+            command=np.array(policy.command),
             target_force=np.float32(target),
             finger_force=measured.finger_force,
             goal_rotation=matrix(goals.quat) if goals else None,
             turns=goals.successes if goals else None,
-            seconds=now,
+            seconds=self._run.port.time,
         )
         return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}")

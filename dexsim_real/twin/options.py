@@ -1,27 +1,19 @@
-"""Options of `python -m dexsim_real.twin`: one dataclass that contains the options of every part."""
+"""Options of `python -m dexsim_real.twin`."""
 
 import dataclasses
 from pathlib import Path
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.plant.shapes import SHAPES
-from dexsim_real.twin.wire.command_check import LimitsConfig
-from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig
-from dexsim_real.twin.wire.faults import FaultConfig
-from dexsim_real.twin.wire.firmware import FirmwareConfig
-from dexsim_real.twin.wire.line import LineConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TwinArguments:
+class TwinArguments(Config):
     """Options of `python -m dexsim_real.twin`."""
 
     task: str = setting("rotate", choices=TASKS)
     """Task: `rotate` mounts the hand palm up with a cube, `grasp` upside down with various objects."""
-    policy: str | None = None
-    """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. None for the
-    shipped policy of the task."""
     hand: str = ""
     """The TOML of a hand of your own, with the joints and taxels that the wire format has; empty for the XHand."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
@@ -36,11 +28,6 @@ class TwinArguments:
     """Number of the first trial. A trial does not depend on the trials before it."""
     shape: str = setting("any", choices=("any", *SHAPES))
     """Shape of the objects (grasp)."""
-    command: float | None = setting(None, unit="1", low=0.0, high=1.0)
-    """Grip command for the command line that is shown, and for the results; None leaves it out."""
-    calibration: Path | None = None
-    """Calibration file for the command line that is shown; None for a temporary file for nominal motors. `python -m
-    dexsim_real.calibrate` creates one, as for a real hand."""
     link: Path | None = None
     """Path of the hand's port; None for one in a new temporary folder."""
     imu_link: Path | None = None
@@ -51,22 +38,14 @@ class TwinArguments:
     """JSON file for results, statistics and events, written at the end; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
-    press: bool = False
-    """A press bench in place of the trials: a pen on foam in front of the fingertip that `python -m
-    dexsim_real.calibrate` presses."""
     plant_model: Path | None = None
-    """MJCF of the hand by somebody else, which takes the place of the emulated hand's body, motors and contacts; or a
-    TOML that names it and its parts (docs/emulated_hand.md). None for the emulated hand's own."""
-    line: LineConfig = setting(LineConfig())
-    """Timing of the serial line."""
-    firmware: FirmwareConfig = setting(FirmwareConfig())
-    """The palm board."""
-    limits: LimitsConfig = setting(LimitsConfig())
-    """Limits against which every command is checked."""
-    faults: FaultConfig = setting(FaultConfig())
-    """Injected faults."""
-    object: ObjectSensorConfig = setting(ObjectSensorConfig())
-    """IMU and camera of the object."""
-
-    def __post_init__(self):
-        validate(self)
+    """Third-party MJCF of the hand, which takes the place of the emulated hand's body and contacts; or a TOML that
+    names it and its parts (docs/emulated_hand.md). None for the emulated hand's own."""
+    faults: tuple[str, ...] = ()
+    """Injected faults, each "12.5 stall 0.2" (seconds after the first exchange, kind, values) or "1% flip" (share of
+    the exchanges). Values that are left out are sampled. `flip|drop|duplicate answer|request`, `late|stall|disconnect
+    SECONDS`, `heat JOINT|tipTIP|palm KELVIN SECONDS`, `error palm|joint|tip JOINT BITS SECONDS`, `off JOINT SECONDS`
+    (-1: all), `jam JOINT MILLIAMPERES SECONDS`, `refuse NUMBER SECONDS`, `angle JOINT offset|stuck RADIANS SECONDS`,
+    `stuck TIP TAXEL COUNT`."""
+    watchdog: float = setting(0.0, unit="s", low=0.0, high=10.0)
+    """Time without a valid exchange after which the motors go off; 0: never. What the real hand does is not known."""

@@ -11,11 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.core.config import to_dict
-from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import Plant
-from dexsim_real.twin.wire.command_check import CommandCheck
 from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
 from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import Firmware
@@ -39,8 +36,7 @@ class PlantClock:
 
     def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
         self.plant, self.now, self._note = plant, start, note
-        self.slipped, self.simulated, self.spent = 0.0, 0.0, 0.0  # s
-        self.cost = 0.0  # s, computing time of a slice
+        self.slipped, self.cost = 0.0, 0.0  # s; computing time s of a slice
         self._noted_at = -1e9
 
     @property
@@ -52,36 +48,17 @@ class PlantClock:
         """Advance the plant to a time in s, by at most `limit` s."""
         lag = now - self.now
         if lag > self.MAX_LAG:
-            self._slip(now, lag - limit)
+            self.now += lag - limit
+            self.slipped += lag - limit
+            if now > self._noted_at + 5.0:
+                self._noted_at = now
+                self._note(f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far")
         step = min(now - self.now, limit)
-        if step <= 0:
-            return
-        start = time.monotonic()
-        self.plant.advance(step)
-        took = time.monotonic() - start
-        self.now += step
-        self.simulated += step
-        self.spent += took
-        self.cost += 0.05 * (took * self.SLICE / max(step, 1e-4) - self.cost)
-
-    def _slip(self, now: float, seconds: float) -> None:
-        self.now += seconds
-        self.slipped += seconds
-        if now > self._noted_at + 5.0:
-            self._noted_at = now
-            share = self.spent / self.simulated if self.simulated else 0.0
-            self._note(
-                f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far "
-                f"(a simulated second takes {share:.2f} s); close other programs"
-            )
-
-    def report(self) -> dict[str, float]:
-        """Simulated time, slip and computing time; JSON-able."""
-        return {
-            "simulated_s": round(self.simulated, 3),
-            "slipped_s": round(self.slipped, 3),
-            "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0,
-        }
+        if step > 0:
+            start = time.monotonic()
+            self.plant.advance(step)
+            self.now += step
+            self.cost += 0.05 * ((time.monotonic() - start) * self.SLICE / max(step, 1e-4) - self.cost)
 
 
 class Twin:
@@ -89,7 +66,6 @@ class Twin:
 
     Args:
       arguments: options of the command.
-      hand: model of the hand.
       plant: the physics.
       folder: for ports that the options do not name.
       show: called with one line for every event.
@@ -98,12 +74,9 @@ class Twin:
       HandError: a port or socket cannot be created.
     """
 
-    HICCUP = 0.02  # s, a longer interruption by the machine exceeds the bridge's default `--link.margin`
-
     def __init__(
         self,
         arguments: TwinArguments,
-        hand: Hand,
         plant: Plant,
         folder: Path,
         show: Callable[[str], None] = lambda text: None,
@@ -112,16 +85,12 @@ class Twin:
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.start, seed = time.monotonic(), arguments.seed
         self.clock = PlantClock(plant, self.start, self.note)
-        self.firmware = Firmware(plant, arguments.firmware, self.note)
+        self.firmware = Firmware(plant, arguments.watchdog, self.note)
         self.injector = Injector(arguments.faults, seed)
-        self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
         self.line = HandLine(
             Terminal(arguments.link or folder / "hand"),
-            plant,
             self.firmware,
-            self.check,
             self.injector,
-            arguments.line,
             seed=seed,
             catch_up=self.clock.catch_up,
             note=self.note,
@@ -130,18 +99,14 @@ class Twin:
         self.masks: EmulatedCamera | None = None
         try:
             if arguments.task == "rotate":
-                self.imu = EmulatedImu(
-                    arguments.imu_link or folder / "imu", plant, arguments.object, seed=seed, start=self.start
-                )
-            if arguments.task == "grasp" or arguments.mask_socket:
-                self.masks = EmulatedCamera(
-                    arguments.mask_socket or folder / "masks", plant, arguments.object, seed=seed, start=self.start
-                )
+                self.imu = EmulatedImu(arguments.imu_link or folder / "imu", plant, seed=seed, start=self.start)
+            else:
+                path = arguments.mask_socket or folder / "masks"
+                self.masks = EmulatedCamera(path, plant, seed=seed, start=self.start)
         except BaseException:
             self.close()
             raise
         self._first = self._trial = plant.trial
-        self.hiccups = 0  # number of interruptions by the machine longer than `HICCUP`
         self._stop = False
 
     def stop(self) -> None:
@@ -150,39 +115,30 @@ class Twin:
 
     def run(self) -> None:
         """Run until all trials have ended, or `stop` was called."""
-        sides = [side for side in (self.imu, self.masks) if side]
-        now = self.clock.now = time.monotonic()
+        sensors = [sensor for sensor in (self.imu, self.masks) if sensor]
+        self.clock.now = time.monotonic()
         while not self._stop:
-            before, now = now, time.monotonic()
-            self.hiccups += now - before > self.HICCUP
+            now = time.monotonic()
             self.line.serve(now)
             free = self.line.due() - now
-            for side in sides:
+            for sensor in sensors:
                 # A picture takes about 1 ms to compute: postpone it when the port is due soon.
-                if free > 0.002 or now > side.due + 0.01:
-                    side.serve(now)
+                if free > 0.002 or now > sensor.due + 0.01:
+                    sensor.serve(now)
             if free > self.clock.cost or now > self.clock.due + 0.01:
                 if now >= self.clock.due:
                     self.clock.catch_up(now, PlantClock.SLICE)
-                until = min(self.clock.due, *(side.due for side in sides))
+                until = min(self.clock.due, *(sensor.due for sensor in sensors))
             else:
                 until = now + free
-            if self.plant.trial != self._trial:
-                self._trial = self.plant.trial
-                done = self._trial - self._first
-                ended = self.plant.results()[done - 1 : done]
-                end = ended[0].get("end", "") if ended else ""
-                self.note(f"end of trial {done} of {self.arguments.trials}: {end}")
-                if done >= self.arguments.trials:
-                    self._stop = True
-                    self.note("all trials are over: the hand's port closes")
+            self._count_trials()
             pause = min(until, self.line.due()) - time.monotonic()
             ports = [self.line.terminal] if self.line.terminal.connected else []
             select.select(ports, [], [], max(pause, 0.0))
 
     def close(self) -> None:
         """Close all ports."""
-        for part in (self.line, self.imu, self.masks):
+        for part in (self.line.terminal, self.imu, self.masks):
             if part:
                 part.close()
 
@@ -194,33 +150,27 @@ class Twin:
 
     def report(self) -> dict[str, Any]:
         """Results of the trials, and all statistics; JSON-able."""
-        arguments, firmware, line = self.arguments, self.firmware, self.line
+        arguments = self.arguments
         return {
             "task": arguments.task,
             "seed": arguments.seed,
-            "parameter_kind": arguments.parameters,
             "start": self.start,
-            "seconds": round(time.monotonic() - self.start, 3),
             "trials": self.plant.results()[: arguments.trials],
-            "line": dict(line.counts),
-            "firmware": dict(firmware.counts),
-            "faults": {
-                "injected": dict(self.injector.injected),
-                "expected": self.injector.expected(),
-                "config": to_dict(arguments.faults),
-            },
-            "commands": self.check.report(),
-            "stuck": [[*taxel, count] for taxel, count in firmware.stuck.items()],
-            "watchdog": {
-                "limit_s": arguments.firmware.watchdog,
-                "longest_s": firmware.longest,
-                "trips": firmware.trips,
-            },
-            "hiccups": self.hiccups,
-            "physics": self.clock.report(),
-            "slowest_exchange_ms": round(1e3 * line.slowest, 3),
-            "late": line.lateness.summary(),
-            "imu_frames": self.imu.sent if self.imu else 0,
-            "masks": dict(self.masks.counts) if self.masks else {},
+            "line": dict(self.line.counts),
+            "exchanges": dict(self.firmware.counts),
+            "injected_faults": dict(self.injector.injected),
+            "watchdog_trips": self.firmware.trips,
+            "slipped_s": round(self.clock.slipped, 3),
+            "late": self.line.lateness.summary(),
             "events": [list(event) for event in self.events],
         }
+
+    def _count_trials(self) -> None:
+        if self.plant.trial == self._trial:
+            return
+        self._trial = self.plant.trial
+        done = self._trial - self._first
+        self.note(f"end of trial {done} of {self.arguments.trials}: {self.plant.results()[done - 1].get('end', '')}")
+        if done >= self.arguments.trials:
+            self._stop = True
+            self.note("all trials are over: the hand's port closes")

@@ -1,45 +1,43 @@
 """A run on the emulated hand in virtual time: the bridge's loops in one process, as fast as they compute.
 
 Exchange loop (`dexsim_real.loop`) and policy loop (`dexsim_real.control.policy_loop`) are those of a run on a hand.
-Their times are events: exchanges at 83 Hz that take 9.6 ms, the policy, the IMU and the camera at their own rates.
-Every exchange is encoded to frames and executed by the emulated palm board, so quantisation and delays are those of
-the wire.
+Whoever waits lets the time pass: meanwhile the plant advances, and policy, IMU and camera have their events. Every
+exchange is executed by the emulated palm board in the blocks of the wire, so quantisation and delays are those of the
+wire.
 """
 
-import dataclasses
-import functools
 import heapq
 import itertools
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
 from dexsim_real.control.controller import Controller
-from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyDecision, TargetRequest
-from dexsim_real.loop import TARE_SAMPLES, Exchange, ExchangeLoop
-from dexsim_real.sensors.camera import HeightSensor
-from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
-from dexsim_real.sensors.imu import BAUD, ImuReader, encode, multiply
+from dexsim_real.core.errors import HandError
+from dexsim_real.loop import ExchangeLoop
+from dexsim_real.sensors.camera import CameraConfig, HeightSensor
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.imu import BAUD, ImuReader
 from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.twin.plant.assistant import nominal_gravity
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.shapes import matrix, turn
-from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig, outline, silhouette
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Parser
-from dexsim_real.wire.link import HandPort, Reply
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
+from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
+from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
+from dexsim_real.wire.link import LinkCounts, Reply
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
-IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 _LEVER = 2.0**-4  # m, of a fingertip about any joint; cancels out in the ideal calibration
+_APPROACH, _PLACE = 2.0, 0.5  # s to the start posture, and in it
 _SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
 
@@ -58,65 +56,103 @@ def ideal_calibration(hand: Hand) -> Calibration:
         real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
         sim=side(np.full(hand.num_joints, _LEVER)),
         torque_scale=hand.torque_limit,
-        force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
+        force_per_count=np.full(hand.num_fingers, FORCE_PER_COUNT),
         hand=hand.name,
         joint_names=hand.joint_names,
         finger_names=hand.finger_names,
     )
 
 
-class Schedule:
-    """A queue of events in virtual time."""
+class VirtualPort:
+    """`HandPort` of an emulated hand in virtual time, and that time: `clock` and `sleep` take the place of `time`'s.
 
-    def __init__(self) -> None:
-        self._queue: list[tuple[float, int, Callable[[], None]]] = []
-        self._count = 0
+    Args:
+      plant: the physics.
+    """
 
-    def at(self, time: float, what: Callable[[], None]) -> None:
+    def __init__(self, plant: Plant):
+        self.plant, self.firmware = plant, Firmware(plant)
+        self.time, self.counts, self._sequence = 0.0, LinkCounts(), 0
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+
+    def connect(self) -> str:
+        """There is nothing to open."""
+        return "emulated: hand 0"
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def exchange(self, command: np.ndarray) -> Reply:
+        """Send a command and wait for the answer, which always comes."""
+        sent = self.time
+        self.wait_until(sent + REQUEST)
+        request = Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes())
+        answer = self.firmware.answer(request, self.time)
+        assert answer is not None, "the request is addressed to this hand"
+        self.wait_until(sent + ROUND_TRIP)
+        self._sequence += 1
+        self.counts.sent += 1
+        self.counts.answered += 1
+        return Reply(decode_state(answer.data), sent, self.time, self._sequence, generation=1)
+
+    def clock(self) -> float:
+        """Virtual time in s."""
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        """Let a duration in s pass."""
+        self.wait_until(self.time + seconds)
+
+    def at(self, time: float, call: Callable[[], None]) -> None:
         """Schedule a call at a time in s."""
-        heapq.heappush(self._queue, (time, self._count, what))
-        self._count += 1
+        heapq.heappush(self._events, (time, next(self._order), call))
 
-    def pop(self) -> tuple[float, Callable[[], None]]:
-        """Remove and return the next event: its time in s and its call."""
-        time, _, what = heapq.heappop(self._queue)
-        return time, what
+    def every(self, period: float, first: float, call: Callable[[], None]) -> None:
+        """Schedule a call every `period` s from a time in s on."""
+
+        def repeat() -> None:
+            call()
+            self.at(self.time + period, repeat)
+
+        self.at(first, repeat)
+
+    def wait_until(self, time: float) -> None:
+        """Let the time pass until a time in s, with all events up to it."""
+        while self._events and self._events[0][0] <= time:
+            when, _, call = heapq.heappop(self._events)
+            self._pass(when)
+            call()
+        self._pass(time)
+
+    def _pass(self, time: float) -> None:
+        if time > self.time:
+            self.plant.advance(time - self.time)
+            self.time = time
 
 
 class VirtualImu(ImuReader):
     """The IMU in the object, and the bridge's processing of it, without a port."""
 
-    def __init__(self, plant: EmulatedHand):
+    def __init__(self, port: VirtualPort, seed: int):
         super().__init__()
-        self._plant, self._index = plant, 0
-        # The IMU's world frame has the true vertical as z and an arbitrary heading.
-        up = plant.up
-        level = np.array([1.0 + up[2], up[1], -up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1, 0, 0])
-        self._level = multiply(turn((0, 0, 1), 1.0 + plant.seed), level / np.linalg.norm(level))
+        self._port, self._frames = port, ImuFrames(port.plant, seed)
+        port.every(1 / IMU_RATE, 0.001, self._sample)
 
-    def sample(self) -> bytes:
-        """The bytes of the current orientation."""
-        _, quat, _ = self._plant.measure_object()
-        self._index += 1
-        return encode(self._index, multiply(self._level, multiply(quat, self._mount)))
+    def _sample(self) -> None:
+        data = self._frames.sample()
+        arrival = self._port.time + 10 * len(data) / BAUD  # ten bits a byte
+        self._port.at(arrival, lambda: self.receive(arrival, data))
 
 
 class VirtualCamera(HeightSensor):
-    """The camera and the bridge's height sensor, without a socket."""
+    """The camera and the bridge's height sensor, without a socket; its pictures come when they are scheduled."""
 
-    def __init__(self, plant: EmulatedHand, controller: Controller):
-        spec, config = controller.spec, ObjectSensorConfig()
-        super().__init__(
-            lambda: None, config.optics, np.asarray(spec.reference, float), spec.object_axes, spec.velocity_filter
-        )
-        self._plant, self._picture = plant, config.picture
-        self._parts = [outline(part) for part in plant.shape.parts]
-
-    def sample(self, time: float) -> None:
-        """Take a picture at a time in s; it shows the object with the delay of the camera."""
-        place, quat, _ = self._plant.measure_object()
-        parts = [points @ matrix(quat).T + place for points in self._parts]
-        self.see(time, silhouette(parts, self._config, self._picture))
+    def __init__(self, port: VirtualPort, controller: Controller):
+        spec, optics = controller.spec, CameraConfig()
+        reference = np.asarray(spec.reference, float)
+        super().__init__(lambda: None, optics, reference, spec.object_axes, spec.velocity_filter)
+        port.every(1 / CAMERA_RATE, 0.002, lambda: self.see(port.time, picture(port.plant, optics)))
 
 
 class Unlimited(Safety):
@@ -132,171 +168,95 @@ class Unlimited(Safety):
         return self._finish(now, Reaction.NONE, "", target if np.isfinite(target).all() else self.commanded)
 
 
-@dataclasses.dataclass(frozen=True)
-class RunOptions:
-    """Options of a virtual run."""
-
-    command: float = 0.5  # in [0, 1]
-    safety: bool = True  # whether the safety limits apply
-    approach: float = 2.0  # s to the start posture
-    place: float = 0.5  # s in the start posture
-    hardware: HardwareConfig = HardwareConfig()
-    limits: SafetyConfig = SafetyConfig()
-
-
-class _Line:
-    """Stands for a port: the exchanges of a run in virtual time are events, and none is refused."""
-
-    refusal = None
-
-
 class VirtualRun:
-    """One trial of a policy on an emulated hand: the bridge's loop, with the plant's time as its clock.
+    """One trial of a policy on an emulated hand: the bridge's loops, with the plant's time as their clock.
 
     Args:
       plant: a new one, before its first trial.
       controller: warmed; it is restarted.
       calibration: of this hand.
-      options: of the run.
+      command: grip command in [0, 1].
+      limits: of the bridge's safety; None is its default.
+      safety: whether these limits apply.
+
+    Raises:
+      HandError: the policy was trained with another mount than the emulated hand's.
     """
 
-    def __init__(self, plant: EmulatedHand, controller: Controller, calibration: Calibration, options: RunOptions):
-        self.plant, self.controller, self.options = plant, controller, options
-        hand = controller.hand
-        self.firmware = Firmware(plant, FirmwareConfig())
-        limits = limits_for(options.limits, controller)
-        self.safety = Safety(hand, limits) if options.safety else Unlimited(hand, limits)
-        self._schedule, self._now = Schedule(), 0.0
-        sensing = HandSensing(hand, options.hardware, calibration)
-        self._loop = ExchangeLoop(cast(HandPort, _Line()), sensing, self.safety, RATE, clock=lambda: self._now)
-        self._requests, self._replies = Parser(frames.HOST_REQUESTS), Parser(frames.HAND_REPLIES)
-        self._exchanges = 0
-        self._newest: Exchange | None = None
-        self.imu = VirtualImu(plant) if "imu" in controller.sources else None
-        self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
+    def __init__(
+        self,
+        plant: EmulatedHand,
+        controller: Controller,
+        calibration: Calibration,
+        command: float = 0.5,
+        limits: SafetyConfig | None = None,
+        *,
+        safety: bool = True,
+    ):
+        trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task)
+        if np.abs(trained - mounted).max() > 0.01:
+            raise HandError(
+                f"the policy was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm frame, the "
+                f"emulated hand has {np.round(mounted, 2).tolist()}; use a policy that was trained with this mount"
+            )
+        self.plant, self.controller = plant, controller
+        limits = limits_for(limits or SafetyConfig(), controller)
+        self.safety = (Safety if safety else Unlimited)(controller.hand, limits)
+        self.port = port = VirtualPort(plant)
+        sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
+        self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
+        self.imu = VirtualImu(port, plant.seed) if "imu" in controller.sources else None
+        self.camera = VirtualCamera(port, controller) if "camera" in controller.sources else None
         self.policy = PolicyLoop(
             controller,
             self.safety,
             ObjectSensors(np.asarray(controller.spec.reference, float), self.camera, self.imu),
-            command=options.command,
-            approach=options.approach,
-            place=options.place,
+            command=command,
+            approach=_APPROACH,
+            place=_PLACE,
         )
         self.trace: list[dict[str, Any]] | None = None
 
     def run(self) -> dict[str, Any]:
         """Run the trial; returns the referee's report, with the measurements of the bridge as `bridge`."""
-        trial = self.plant.trial
+        trial, policy = self.plant.trial, self.policy
         for _ in self.ticking():
             pass
-        return self._summary(trial)
-
-    def ticking(self) -> Iterator[None]:
-        """Run the trial in pieces: yields after each tick of the policy, and ends with the trial."""
-        trial, limit, policy = self.plant.trial, self.plant.limit + _SLACK, self.policy
-        self._schedule.at(0.0, self._exchange)
-        if self.imu:
-            self._schedule.at(0.001, functools.partial(self._sense_orientation, self.imu))
-        if self.camera:
-            self._schedule.at(0.002, functools.partial(self._take_picture, self.camera))
-        self._tare()
-        self._loop.engage()
-        while not self.safety.anchor or policy.approach(self._now):
-            self._until(self._now + 1 / RATE)
-        policy.begin()
-        began = self._now
-        for tick in itertools.count(1):
-            if self.plant.trial != trial or self._now >= began + limit:
-                break
-            policy.command = self.options.command
-            newest = policy.tick(self._now)
-            if newest is not None and self.trace is not None:
-                self.trace.append({"time": self._now, "tick": newest.tick, "measured": newest.sample.measured})
-            self._until(began + tick * self.controller.period)
-            yield
-
-    @property
-    def now(self) -> float:
-        """Virtual time since the start, s."""
-        return self._now
-
-    @property
-    def goals(self) -> TurnGoals | None:
-        """Goals of the rotation task; None without."""
-        return self.policy.goals
-
-    def measured(self) -> HandMeasurement:
-        """What the bridge measured last."""
-        assert self.safety.sample is not None, "no state yet"
-        return self.safety.sample.measured
-
-    # --- events -----------------------------------------------------------------------------------
-
-    def _exchange(self) -> None:
-        """A cycle of the exchange loop: a request; its answer arrives 9.6 ms later."""
-        decision, block = self._loop.request()
-        self._exchanges += 1
-        data = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, block.tobytes()).encode()
-        self._schedule.at(self._now + REQUEST, functools.partial(self._answer, decision, data, self._now))
-        self._schedule.at(self._now + 1 / RATE, self._exchange)
-
-    def _answer(self, decision: SafetyDecision, data: bytes, sent: float) -> None:
-        for frame in self._requests.feed(data):
-            reply = self.firmware.answer(frame, self._now)
-            assert reply is not None, "a request of our own is answered"
-            receive = functools.partial(self._receive, decision, reply.encode(), sent)
-            self._schedule.at(sent + ROUND_TRIP, receive)
-
-    def _receive(self, decision: SafetyDecision, data: bytes, sent: float) -> None:
-        for frame in self._replies.feed(data):
-            reply = Reply(frames.decode_state(frame.data), sent, self._now, self._exchanges, generation=1)
-            self._newest = self._loop.take(decision, reply)
-
-    def _sense_orientation(self, imu: VirtualImu) -> None:
-        data = imu.sample()
-        there = self._now + 10 * len(data) / BAUD  # ten bits a byte
-        self._schedule.at(there, functools.partial(imu.receive, there, data))
-        self._schedule.at(self._now + 1 / IMU_RATE, functools.partial(self._sense_orientation, imu))
-
-    def _take_picture(self, camera: VirtualCamera) -> None:
-        camera.sample(self._now)
-        self._schedule.at(self._now + 1 / CAMERA_RATE, functools.partial(self._take_picture, camera))
-
-    # --- pieces ---------------------------------------------------------------------------------
-
-    def _tare(self) -> None:
-        states: list[np.ndarray] = []
-        self._loop.track_taxels = False
-        while len(states) < TARE_SAMPLES:
-            self._newest = None
-            self._until(self._now + 1 / RATE)
-            states += [self._newest.state] if self._newest is not None else []
-        self._loop.track_taxels = True
-        self._loop.sensing.set_tare(states)
-
-    def _until(self, time: float) -> None:
-        """Run the plant and the events up to a time in s."""
-        while True:
-            when, what = self._schedule.pop()
-            if when > time:
-                self._schedule.at(when, what)
-                break
-            self._go(when)
-            what()
-        self._go(time)
-
-    def _go(self, time: float) -> None:
-        self.plant.advance(time - self._now)
-        self._now = time
-
-    def _summary(self, trial: int) -> dict[str, Any]:
         report = next(r for r in self.plant.results() if r["trial"] == trial)
-        policy = self.policy
         measured = {
             "ticks": policy.ticks,
             "sensed_force": np.round(policy.finger_force / max(policy.ticks, 1), 4).tolist(),
             "safety": dict(self.safety.counts),
             "latched": self.safety.latched,
-            "successes": self.goals.successes if self.goals else None,
+            "successes": policy.goals.successes if policy.goals else None,
         }
-        return report | {"command": self.options.command, "bridge": measured}
+        return report | {"command": policy.command, "bridge": measured}
+
+    def ticking(self) -> Iterator[None]:
+        """Run the trial in pieces: yields after the policy's ticks, and ends with the trial."""
+        trial, policy, port = self.plant.trial, self.policy, self.port
+        self.loop.tare()
+        self.loop.engage()
+        self.loop.pace.next = port.time + self.loop.pace.period
+        while not self.safety.anchor or policy.approach(port.time):
+            self._cycle()
+        policy.begin()
+        until = port.time + self.plant.limit + _SLACK
+        self._ticked = 0
+        self._tick()
+        port.every(self.controller.period, port.time + self.controller.period, self._tick)
+        while self.plant.trial == trial and port.time < until:
+            ticked = self._ticked
+            self._cycle()
+            if self._ticked != ticked:
+                yield
+
+    def _cycle(self) -> None:
+        self.loop.cycle()
+        self.loop.pace.wait()
+
+    def _tick(self) -> None:
+        self._ticked += 1
+        newest = self.policy.tick(self.port.time)
+        if newest is not None and self.trace is not None:
+            self.trace.append({"time": self.port.time, "tick": newest.tick, "measured": newest.sample.measured})

@@ -6,10 +6,9 @@ from twin_plant import REST, ScriptedPlant
 
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.server import Twin
-from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
-from dexsim_real.twin.wire.faults import FaultConfig, Injector
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.wire.line import HandLine, LineConfig
+from dexsim_real.twin.wire.faults import Injector
+from dexsim_real.twin.wire.firmware import Firmware
+from dexsim_real.twin.wire.line import HandLine
 from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
@@ -29,19 +28,10 @@ def ask(board, kind, data=b"", now=0.0, target=0x80):
 class Bench:
     """A line, and a host that writes and reads in virtual time."""
 
-    def __init__(self, folder, hand, *, line=None, board=None, seed=0):
+    def __init__(self, folder, watchdog=0.0):
         self.plant, self.notes = ScriptedPlant(), []
-        self.board = Firmware(self.plant, board or FirmwareConfig(), self.notes.append)
-        self.line = HandLine(
-            Terminal(folder / "hand"),
-            self.plant,
-            self.board,
-            CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig()),
-            Injector(FaultConfig(), seed),
-            line or LineConfig(),
-            seed=seed,
-            note=self.notes.append,
-        )
+        self.board = Firmware(self.plant, watchdog, self.notes.append)
+        self.line = HandLine(Terminal(folder / "hand"), self.board, Injector(), note=self.notes.append)
         self.now = 100.0
         import serial
 
@@ -73,15 +63,15 @@ class Bench:
 
     def close(self):
         self.port.close()
-        self.line.close()
+        self.line.terminal.close()
 
 
 class Running:
     """A twin that runs in a thread."""
 
-    def __init__(self, hand, folder, plant=None, **options):
+    def __init__(self, folder, plant=None, **options):
         self.plant = plant or ScriptedPlant()
-        self.twin = Twin(TwinArguments(**options), hand, self.plant, folder)
+        self.twin = Twin(TwinArguments(**options), self.plant, folder)
         self._thread = threading.Thread(target=self.twin.run, daemon=True)
         self._thread.start()
 

@@ -4,10 +4,9 @@ from types import SimpleNamespace
 
 from twin_plant import REST, ScriptedPlant
 
-from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
 from dexsim_real.twin.wire.faults import BYTES, Injector
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.wire.line import HandLine, LineConfig
+from dexsim_real.twin.wire.firmware import Firmware
+from dexsim_real.twin.wire.line import HandLine
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.link import LinkConfig
@@ -88,7 +87,7 @@ class Port:
 class Pair:
     """The bridge's driver and an emulated hand on one cable."""
 
-    def __init__(self, hand, monkeypatch, faults, seed=0, watchdog=0.08, **link):
+    def __init__(self, monkeypatch, faults=(), seed=0, watchdog=0.08, **link):
         import serial
 
         self.cable, self.plant, self.notes = Cable(), ScriptedPlant(), []
@@ -97,14 +96,16 @@ class Pair:
             "dexsim_real.wire.serial_hand.time", SimpleNamespace(monotonic=lambda: cable.now, sleep=cable.wait)
         )
         monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(cable, timeout))
-        self.board = Firmware(self.plant, FirmwareConfig(watchdog=watchdog), self.notes.append)
-        self.check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig())
+        self.board = Firmware(self.plant, watchdog, self.notes.append)
         self.injector = Injector(faults, seed)
         self.line = cable.line = HandLine(
-            cable, self.plant, self.board, self.check, self.injector, LineConfig(), seed=seed, note=self.notes.append
+            cable, self.board, self.injector, seed=seed, catch_up=self._catch_up, note=self.notes.append
         )
         self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1), **link))
         self.port.connect()
+
+    def _catch_up(self, now):
+        self.plant.advance(max(now - 1000.0 - self.plant.time, 1e-6))
 
     def exchange(self, mode=Mode.POSITION, period=0.012):
         """One exchange a cycle, as the bridge does."""
@@ -132,15 +133,16 @@ class Pair:
     def agreement(self):
         """What the host counted, beside what was injected."""
         counts, line, made = self.port.counts, self.line.counts, self.injector.injected
-        expected = self.injector.expected()
-        damaged_requests = sum(made[f"{kind} request"] for kind in BYTES)
+        damaged_answers, damaged_requests = (
+            sum(made[f"{kind} {side}"] for kind in BYTES) for side in ("answer", "request")
+        )
         return {
-            "corrupt": (counts.corrupt, expected["corrupt"]),
-            "lost": (counts.lost, expected["lost"]),
+            "corrupt": (counts.corrupt, damaged_answers),
+            "lost": (counts.lost, made["disconnect"]),
             # What the hand never answered, and what came too late.
             "silent": (counts.silent, damaged_requests + line["ignored"] + counts.late),
             "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
             "sent": (counts.sent, line["requests"]),
             "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
-            "damaged": (line["damaged answers"] + line["damaged requests"], expected["corrupt"] + damaged_requests),
+            "damaged": (line["damaged answers"] + line["damaged requests"], damaged_answers + damaged_requests),
         }

@@ -9,6 +9,7 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.wire.frames import Mode
 
 REST = np.array([0.3] * 3 + [0.0] + [0.3] * 8)
+SLACK = 0.006  # s, by which the interval between two commands may be shorter at the hand than at the bridge
 
 
 class ScriptedPlant:
@@ -27,7 +28,7 @@ class ScriptedPlant:
         self.time, self.angle = 0.0, REST.copy()
         self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
         self.motors: MotorCommands | None = None
-        self.orders: list[tuple[float, MotorCommands]] = []
+        self.orders: list[tuple[float, np.ndarray, MotorCommands]] = []  # s; rad, true angles; commands
 
     @property
     def trial(self) -> int:
@@ -35,7 +36,7 @@ class ScriptedPlant:
 
     def drive(self, motors: MotorCommands) -> None:
         self.motors = motors
-        self.orders.append((self.time, motors))
+        self.orders.append((self.time, self.angle.copy(), motors))
 
     def advance(self, seconds: float) -> None:
         self.time += seconds
@@ -46,7 +47,6 @@ class ScriptedPlant:
         self.velocity = (self.angle - before) / seconds
 
     def measure(self) -> PlantMeasurement:
-        position, quat, acceleration = self.measure_object()
         force = np.zeros((5, 120, 3))
         # Quarter of a newton on ten taxels for each radian; what pulls along the tip is half of it.
         force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
@@ -58,20 +58,32 @@ class ScriptedPlant:
             current=-100.0 * self.velocity,
             temperature=self.heat.copy(),
             taxel_force=force,
-            object_quat=quat,
-            object_position=position,
-            object_acceleration=acceleration,
         )
 
     def measure_object(self):
         half = 0.5 * self.turn * self.time
         return np.array([0.047, 0.0, 0.071]), np.array([math.cos(half), math.sin(half), 0.0, 0.0]), 9.81 * self.up
 
-    def warm(self, joint: int, degrees: float) -> None:
-        self.heat[joint] += degrees
-
     def results(self):
         return [{"trial": k} for k in range(self.trial + 1)]
+
+    def violations(self, hand) -> list[str]:
+        """Limits of the bridge that the commands exceeded: compared with the true angles, not the reported ones."""
+        names, before = [], None
+        for time, angles, motors in self.orders:
+            on, position = motors.mode != Mode.PASSIVE, motors.position
+            stays = np.zeros(12, bool) if before is None else on & (before[1].mode != Mode.PASSIVE)
+            away = np.abs(position - angles)
+            outside = (position < hand.joint_lower - 1e-5) | (position > hand.joint_upper + 1e-5)
+            names += ["range"] * bool(np.any(on & outside))
+            names += ["current limit"] * bool(np.any(on & (motors.torque_max > 400)))
+            names += ["reach"] * bool(np.any(on & (away > 0.75)))
+            names += ["start"] * bool(np.any(on & ~stays & (away > 0.05)))
+            if before is not None:
+                step = np.where(stays, np.abs(position - before[1].position), 0.0).max()
+                names += ["speed"] * bool(step > 7.0 * (time - before[0] + SLACK))
+            before = time, motors
+        return names
 
 
 def make(arguments, hand) -> ScriptedPlant:

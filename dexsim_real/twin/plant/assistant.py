@@ -7,16 +7,16 @@ drop never returns to the start posture: after `patience` seconds the assistant 
 fingers leave its place clear.
 """
 
-import dataclasses
 import enum
+from collections.abc import Callable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from dexsim_real.twin.plant import shapes
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import Scene
-from dexsim_real.twin.plant.shapes import ObjectShape, product, turn
+from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, turn
 
 POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
@@ -28,7 +28,10 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
 are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
-PALM_FACE = 0.020  # m, x of the emulated hand's palm
+MOUNT: dict[str, tuple[float, float] | None] = {"grasp": None, "rotate": (-0.2, -0.2)}
+"""Nominal pitch and roll rad of a hand mounted palm up: wrist and thumb side lowered (raised if negative). None is
+upside down."""
+GRAVITY = 9.81  # m/s^2
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
 _OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
@@ -36,16 +39,27 @@ _SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the relea
 _HAND_OVER = 0.5  # s of holding before release, for a runner that continues after a drop
 
 
-class Stage(enum.Enum):
-    """State of the object in a trial."""
+def nominal_gravity(task: str) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame of a hand with the nominal mount."""
+    mount = MOUNT[task]
+    if mount is None:
+        return GRAVITY * np.array([1.0, 0.0, 0.0])
+    pitch, roll = mount
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
 
-    AWAY = "away"
-    HOLD = "hold"
-    FREE = "free"
+
+def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame of a hand tilted by angles [2] rad about two horizontal axes."""
+    down = nominal_gravity(task)
+    way = down / GRAVITY
+    side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made horizontal
+    side = side / np.linalg.norm(side)
+    for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
+        down = matrix(turn(axis, float(angle))) @ down
+    return down
 
 
-@dataclasses.dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Release pose and velocity of an object, palm frame."""
 
     position: np.ndarray  # [3] m
@@ -53,13 +67,11 @@ class Place:
     velocity: np.ndarray  # [3] m/s
 
 
-def sample_place(
-    parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float = PALM_FACE
-) -> Place:
+def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float) -> Place:
     """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
     if parameters.task == "rotate":
-        quat = turn((1.0, 0.0, 0.0), float(parameters.heading_error) * rng.uniform(-1, 1))
-        shift = float(parameters.place_error) * rng.uniform(-1, 1, 2)
+        quat = turn((1.0, 0.0, 0.0), parameters.heading_error * rng.uniform(-1, 1))
+        shift = parameters.place_error * rng.uniform(-1, 1, 2)
         gap, speed = 0.0005, 0.0
     else:
         # The long axis is across the fingers with a small error; the roll about it is uniform.
@@ -68,14 +80,14 @@ def sample_place(
         for axis, angle in (((1, 0, 0), -np.pi / 2), ((0, 0, 1), 0.2 * askew), ((1, 0, 0), 0.5 * about)):
             quat = product(turn(axis, angle), quat)
         shift = 0.01 * rng.uniform(-1, 1, 2)
-        gap, speed = float(parameters.gap), float(parameters.release_speed)
-    up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
+        gap, speed = parameters.gap, parameters.release_speed
+    up = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
     position = np.array([face + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
 def find_place(
-    scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float = PALM_FACE
+    scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float
 ) -> Place | None:
     """Sample a release pose that the hand in its start posture leaves clear; None when 60 attempts find none."""
     data = mujoco.MjData(scene.model)
@@ -96,15 +108,19 @@ def clear(scene: Scene, data: mujoco.MjData, place: Place) -> bool:
     return bool(np.all(data.contact.dist[touching] > -_OVERLAP))
 
 
-def put(
-    scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: np.ndarray | None = None
-) -> None:
-    """Set the object's pose, and its velocity [3] m/s or zero."""
+def put(scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: object = 0.0) -> None:
+    """Set the object's pose, and its velocity [3] m/s."""
     at, dof = scene.object_qpos, scene.object_dof
     data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = position, quat
-    data.qvel[dof : dof + 6] = 0.0
-    if velocity is not None:
-        data.qvel[dof : dof + 3] = velocity
+    data.qvel[dof : dof + 3], data.qvel[dof + 3 : dof + 6] = velocity, 0.0
+
+
+class Stage(enum.Enum):
+    """State of the object in a trial."""
+
+    AWAY = "away"
+    HOLD = "hold"
+    FREE = "free"
 
 
 class Assistant:
@@ -124,14 +140,14 @@ class Assistant:
         self.stage, self._since, self._on = Stage.AWAY, time, False
         self._held: float | None = None
 
-    def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, free: bool | None) -> Stage:
+    def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, is_clear: Callable[[], bool]) -> Stage:
         """Update the stage.
 
         Args:
           time: s.
           targets: [12] rad, joint targets; None when the motors are off.
           joints: [12] rad, joint angles.
-          free: whether the hand leaves the release pose clear; None when unknown (see `wants_clearance`).
+          is_clear: tells whether the hand leaves the release pose clear.
         """
         if self.stage is Stage.FREE:
             return self.stage
@@ -144,15 +160,11 @@ class Assistant:
         if self.stage is Stage.AWAY:
             if off < _ARRIVED and np.max(np.abs(joints - self._posture)) < _NEAR:
                 self.stage, self._held = Stage.HOLD, None
-            elif free and self.wants_clearance(time):
+            elif time - self._since > self._patience and is_clear():
                 self.stage, self._held = Stage.HOLD, time
         elif self._held is None and off > _LEFT or self._held is not None and time - self._held > _HAND_OVER:
             self.stage = Stage.FREE
         return self.stage
-
-    def wants_clearance(self, time: float) -> bool:
-        """Whether `watch` needs to know if the release pose is clear: the patience is over."""
-        return self.stage is Stage.AWAY and self._on and time - self._since > self._patience
 
     def shelf(self, place: Place) -> np.ndarray:
         """Waiting position [3] m of the object."""

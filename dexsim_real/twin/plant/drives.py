@@ -76,11 +76,11 @@ class Drives:
         self.no_load_speed = self._fast * parameters.speed
         self.efficiency, self.coulomb = parameters.efficiency, parameters.coulomb_friction * self._stall
         self.ripple, self.ripple_count = parameters.ripple, parameters.ripple_count
-        self.bias, self.no_load_current = parameters.encoder_bias, float(parameters.no_load_current)
+        self.bias, self.no_load_current = parameters.encoder_bias, parameters.no_load_current
         self._loss = 1.0 - self.efficiency
-        self.thermal = float(parameters.thermal)
+        self.thermal = parameters.thermal
         self._apply_heat()
-        self.delay = np.maximum(float(parameters.latency) - EXCHANGE_COMMAND, 0.0) + parameters.latency_spread
+        self.delay = max(parameters.latency - EXCHANGE_COMMAND, 0.0) + parameters.latency_spread
 
     def send(self, time: float, motors: MotorCommands) -> None:
         """Queue commands that the palm board received at a time in s; the joints' boards receive them later."""

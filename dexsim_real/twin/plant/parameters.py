@@ -6,13 +6,13 @@ an efficiency above one) the other is used. To find out what breaks a policy, th
 ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model (torsional
 friction, thermal effects, ...) and is in every trial.
 
-How wide the fingertips are and how slippery all is has ranges of the emulated hand's own (`own`), which do not follow
-training's: training may not choose what it is tested by.
-
-The ranges are repeated here; a test compares them with the configurations of the shipped policies.
+Rubber and friction have ranges of the emulated hand's own (`sides` "within"), which do not follow training's: training
+may not choose what it is tested by. The other ranges repeat training's; a test compares them.
 """
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -36,17 +36,15 @@ class Band:
     origin: str  # path in a task's configuration
     nominal: float
     per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
-    sides: str = "both"  # possible ends: "both", "high", "low"
-    own: bool = False  # a range of the emulated hand, not of training: values "outside" are sampled within it, too
+    sides: str = "both"  # possible ends: "both", "high", "low"; "within": the hand's own range, not training's
 
     def outside(self) -> tuple[tuple[float, float], ...]:
-        """The intervals beyond its ends, lowest first; of an own range the range."""
-        if self.own:
-            return ((self.low, self.high),)
+        """The intervals for values outside, lowest first."""
         width = self.high - self.low
         below = (self.low - FAR * width, self.low - NEAR * width)
         above = (self.high + NEAR * width, self.high + FAR * width)
-        return {"both": (below, above), "low": (below,), "high": (above,)}[self.sides]
+        sides = {"both": (below, above), "low": (below,), "high": (above,), "within": ((self.low, self.high),)}
+        return sides[self.sides]
 
     def sample(self, rng: np.random.Generator, kind: str) -> np.ndarray:
         """Sample values of a kind in `KINDS`; the shape follows from `per`."""
@@ -90,11 +88,13 @@ BANDS: dict[str, Band] = {
     # --- the object and its contacts
     "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
     "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
-    "friction": Band(0.35, 1.1, "1", "", 0.8, own=True),  # rubber: dusty to clean
-    "link_friction": Band(0.25, 1.0, "1", "", 0.5, own=True),  # plastic and painted metal
+    "friction": Band(0.35, 1.1, "1", "", 0.8, sides="within"),  # rubber: dusty to clean
+    "link_friction": Band(0.25, 1.0, "1", "", 0.5, sides="within"),  # plastic and painted metal
     "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
     "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
-    "rubber": Band(0.0, 0.001, "m", "", 0.0005, own=True),  # beyond the taxels; the maker's shell is within 0.5 mm
+    "rubber": Band(
+        0.0, 0.001, "m", "", 0.0005, sides="within"
+    ),  # beyond the taxels; the maker's shell is within 0.5 mm
 }
 """Bands of both tasks; `TASK_BANDS` adds to them or replaces them."""
 
@@ -138,7 +138,6 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
     "taxel_spread": 0.08,  # standard deviation of the gains
     "taxel_threshold": 0.06,  # N
     "taxel_crosstalk": 0.06,  # share of a taxel's force that spreads to its neighbours
-    "taxel_period": 0.01,  # s between two samples of a fingertip
     "camera_noise": 0.0025,  # m, white noise of the object's position after segmentation
     "camera_delay": 0.03,  # s from a picture to its mask
     "imu_noise": 0.01,  # rad, white noise
@@ -150,9 +149,10 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
 """Parameters that training does not randomise or does not model: one value for all trials."""
 
 
-_SIZES = TASK_BANDS["grasp"].keys() - {"gap", "release_speed"} | {"edge"}
-_POSITIVE = _SIZES | {"inertia_scale", "stiffness_contact", "palm_stiffness", "taxel_period"}
-"""What is divided by, or has to have a size or a mass."""
+OF_THE_FILE = frozenset(
+    "friction link_friction stiffness_contact restitution rubber torsion rolling palm_stiffness cone_ratio".split()
+)
+"""Parameters that a plant model has its own values for."""
 
 PUSHES = {"grasp": (0.5, 0.3), "rotate": (1 / 6, 0.1)}
 """Pushes per second, and largest change of velocity m/s by a push, as in the evaluation of each task."""
@@ -163,18 +163,13 @@ class TrialParameters:
     """Parameters of one trial, by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`. Each is also an attribute."""
 
     task: str
-    kind: str
     value: dict[str, np.ndarray]
 
-    def __getattr__(self, name: str) -> np.ndarray:
-        try:
-            return self.__dict__["value"][name]
-        except KeyError:
-            raise AttributeError(name) from None
-
-    def summary(self) -> dict[str, float | list[float]]:
-        """The sampled parameters, JSON-able."""
-        return {name: np.round(value, 6).tolist() for name, value in self.value.items() if name not in STRUCTURE}
+    def __getattr__(self, name: str) -> Any:
+        value = self.__dict__["value"].get(name)
+        if value is None:
+            raise AttributeError(name)
+        return value if value.ndim else float(value)
 
 
 def bands(task: str) -> dict[str, Band]:
@@ -183,7 +178,7 @@ def bands(task: str) -> dict[str, Band]:
 
 
 def sample_trial(
-    task: str, rng: np.random.Generator, kind: str = "outside", overrides: dict[str, float | str] | None = None
+    task: str, rng: np.random.Generator, kind: str = "outside", overrides: Mapping[str, float | str] | None = None
 ) -> TrialParameters:
     """Sample the parameters of a trial.
 
@@ -195,29 +190,17 @@ def sample_trial(
         parameter.
 
     Raises:
-      HandError: there is no such task, kind or parameter.
+      HandError: there is no such parameter or kind.
     """
-    if task not in TASKS or kind not in KINDS:
-        raise HandError(f"no parameters of {task!r} {kind!r}: tasks are {', '.join(TASKS)}, kinds {', '.join(KINDS)}")
     table, given = bands(task), overrides or {}
     for name, number in given.items():
         if name not in table and name not in STRUCTURE:
-            known = ", ".join(sorted([*table, *STRUCTURE]))
-            raise HandError(f"the emulated hand has no parameter {name!r}; choose from {known}")
+            names = ", ".join(sorted([*table, *STRUCTURE]))
+            raise HandError(f"the emulated hand has no parameter {name!r}; choose from {names}")
         if isinstance(number, str) and (number not in KINDS or name not in table):
             raise HandError(f"{name} = {number!r}: give a number, or for a sampled parameter one of {', '.join(KINDS)}")
-        if not isinstance(number, str):
-            _check(name, number, table.get(name))
     kinds = {name: number for name, number in given.items() if isinstance(number, str)}
     value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
-    return TrialParameters(task, kind, value)
-
-
-def _check(name: str, number: float, band: Band | None) -> None:
-    """Refuse a value that no hand or object has. Only what lies to both sides of zero may be negative."""
-    if name in _POSITIVE and not number > 0:
-        raise HandError(f"{name} = {number:g}: must be above 0")
-    if (band is None or band.low >= 0) and not number >= 0:
-        raise HandError(f"{name} = {number:g}: must not be negative")
+    return TrialParameters(task, value)

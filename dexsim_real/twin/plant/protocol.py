@@ -1,7 +1,6 @@
 """The interface between the physics of an emulated hand and its wire.
 
-A `Plant` simulates joints, motors, skin and object. `dexsim_real.twin.wire` translates bytes into calls of a plant, in
-real time, and knows nothing of physics.
+`dexsim_real.twin.wire` translates bytes into calls of a `Plant`, in real time, and knows nothing of physics.
 """
 
 import dataclasses
@@ -34,9 +33,6 @@ class PlantMeasurement:
     current: np.ndarray  # [12] mA
     temperature: np.ndarray  # [12] degC, of the motors
     taxel_force: np.ndarray  # [5, 120, 3] N along x, y, z of the wire; z points into the tip
-    object_quat: np.ndarray  # [4] (w, x, y, z) of the object in the palm frame
-    object_position: np.ndarray  # [3] m, palm frame
-    object_acceleration: np.ndarray  # [3] m/s^2, measured by an IMU in the object, object frame
 
 
 class Plant(Protocol):
@@ -72,10 +68,6 @@ class Plant(Protocol):
 
         All with delay, noise and bias.
         """
-        ...
-
-    def warm(self, joint: int, degrees: float) -> None:
-        """Heat a motor by this many K (a fault); cool it if negative."""
         ...
 
     def results(self) -> list[dict[str, Any]]:

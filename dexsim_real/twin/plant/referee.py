@@ -35,19 +35,14 @@ class Referee:
 
     def __init__(self, task: str, seconds: float | None = None):
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
-        self.time, self.end = 0.0, ""
+        self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
+        self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
         self._reference = np.array(REFERENCES[task])
         self._touched = -math.inf
-        self._counted, self._weight = 0, 0.0
-        self._force, self._total, self._limited = np.zeros(5), 0.0, 0.0
+        self._counted, self._limited = 0, 0
+        self._force, self._duty, self._speed = np.zeros(5), np.zeros(5), 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
-        self._duty, self._speed = np.zeros(5), 0.0
         self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
-
-    @property
-    def over(self) -> bool:
-        """Whether the trial has ended."""
-        return bool(self.end)
 
     def watch(
         self,
@@ -55,9 +50,7 @@ class Referee:
         position: np.ndarray,
         quat: np.ndarray,
         spin: np.ndarray,
-        tips: np.ndarray,
-        normal: np.ndarray,
-        taxels: np.ndarray,
+        forces: dict[str, np.ndarray],
         joint_speed: np.ndarray,
         at_limit: np.ndarray,
     ) -> None:
@@ -68,50 +61,40 @@ class Referee:
           position: [3] m of the object, palm frame.
           quat: [4] orientation of the object, palm frame.
           spin: [3] rad/s, angular velocity of the object, palm frame.
-          tips: [5, 3] N, the solver's force on each fingertip.
-          normal: [5] N of that, along the contact's normal.
-          taxels: [5] N of that, on the taxels.
+          forces: [5] N on the fingertips: "force" whole, "normal" along the contact's normal, "taxels" on the taxels.
           joint_speed: [12] rad/s.
           at_limit: [12] bool, joints at their torque limit.
         """
-        if self.over:
+        if self.end:
             return
         self.time += step
-        strength = np.linalg.norm(tips, axis=-1)
+        touching = forces["force"] > TOUCH
         self._speed += step * float(np.mean(np.abs(joint_speed)))
-        self._duty += step * (strength > TOUCH)
-        if np.any(strength > TOUCH):
+        self._duty += step * touching
+        if touching.any():
             self._touched = self.time
         away = float(np.linalg.norm(position - self._reference))
         tilt = math.acos(float(np.clip(matrix(quat)[:, 0] @ _AXIS, -1.0, 1.0)))
         if away > LOST[self.task] or (self.goals and tilt > TIPPED):
             pushed = self.time - self._touched <= _RECENT
-            kind = "tipped" if away <= LOST[self.task] else "pushed out" if pushed else "slipped"
-            self.end = f"dropped: {kind}"
+            self.end = f"dropped: {'tipped' if away <= LOST[self.task] else 'pushed out' if pushed else 'slipped'}"
             return
         if self.goals:
             for count in self.goals.values():
-                count.watch(self.time, quat, away, float(spin @ _AXIS))
+                count.watch(quat, away, float(spin @ _AXIS))
         elif self.time > self.window[0]:
-            self._grip({"force": strength, "normal": normal, "taxels": taxels})
+            self._grip(forces)
             self._limited += bool(np.any(at_limit))
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
 
-    @property
-    def window(self) -> tuple[float, float]:
-        """From when to when [s] after release forces count."""
-        return min(_SETTLE, self.limit / 2), self.limit
-
     def _grip(self, forces: dict[str, np.ndarray]) -> None:
         """Accumulate forces [5]. The command applies to the four fingers; the thumb balances them."""
-        strength = forces["force"]
-        touching = strength[1:] > _GRIP
+        touching = forces["force"][1:] > _GRIP
         if touching.any():
             for name, force in forces.items():
                 self._finger[name] += float(force[1:][touching].mean())
-        self._force += strength
-        self._total += float(strength.sum())
+        self._force += forces["force"]
         self._counted += 1
 
     def report(self) -> dict[str, Any]:
@@ -135,18 +118,14 @@ class Referee:
                 "force": np.round(self._force / count, 4).tolist(),
                 "window_s": list(self.window),
                 **{f"finger_{name}": round(total / count, 4) for name, total in self._finger.items()},
-                "total_force": round(self._total / count, 4),
+                "total_force": round(float(self._force.sum()) / count, 4),
                 "torque_limited": round(self._limited / count, 4),
             }
-        task, paper = self.goals["task"], self.goals["paper"]
         return report | {
-            "successes": task.count,
-            "paper_successes": paper.count,
-            "success_times": task.times,
-            "seconds_per_success": task.times[-1] / task.count if task.count else None,
+            "successes": self.goals["task"].count,
+            "paper_successes": self.goals["paper"].count,
             "seconds_to_fall": round(self.time, 4),
-            "fell": self.over and self.end != "time limit",
-            "turned": round(task.angle, 4),
+            "fell": self.end.startswith("dropped"),
         }
 
 
@@ -158,21 +137,14 @@ class GoalCount:
     """
 
     def __init__(self, fastest: float):
-        self._fastest = fastest
-        self.count, self.angle = 0, 0.0
-        self.times: list[float] = []
+        self._fastest, self.count = fastest, 0
         self._start: float | None = None
-        self._heading = 0.0
 
-    def watch(self, time: float, quat: np.ndarray, away: float, spin: float) -> None:
-        """Update with time s, orientation [4], distance m from the nominal position, spin rad/s about the axis."""
-        heading = 2 * math.atan2(quat[1], quat[0])  # angle of the rotation about x nearest to the orientation
-        if self._start is None:
-            self._start = self._heading = heading
-        self.angle += (heading - self._heading + math.pi) % (2 * math.pi) - math.pi
-        self._heading = heading
+    def watch(self, quat: np.ndarray, away: float, spin: float) -> None:
+        """Update with orientation [4], distance m from the nominal position, spin rad/s about the axis."""
+        if self._start is None:  # The heading: angle of the rotation about x nearest to the orientation.
+            self._start = 2 * math.atan2(quat[1], quat[0])
         goal = turn((1.0, 0.0, 0.0), self._start + (self.count + 1) * GOAL_STEP)
         apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
         if apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= self._fastest:
             self.count += 1
-            self.times.append(round(time, 4))

@@ -1,27 +1,28 @@
-"""The MuJoCo model of a trial: the hand with gear play, an object, their contacts.
+"""The MuJoCo model of a trial: the hand with motors and gear play, an object, their contacts.
 
 Each joint is two hinges about one axis. The first is the drive, with the rotor's inertia, friction and the encoder. The
 second is the gear play: free within its gap, then stiff. Contacts are springs of given stiffness with elliptic friction
-cones; rubber fingertips also have torsional friction.
+cones; rubber fingertips also have torsional friction. A foreign hand keeps the contacts of its file.
 """
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
-from dexsim_real.core.errors import HandError
+from dexsim_real.twin.plant.hand_model import HandModel
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
 
-TIMESTEP = 0.0005  # s
+TIMESTEP = 0.0005  # s, of the emulated hand's own model
 ROTORS = (8e-4, 4e-4)  # kg m^2, inertia of the strong and the weak motors as seen at the joint
 STRONG = 0.8  # Nm, torque limit above which a joint has a strong motor
 END_STOP = 300.0  # Nm/rad
 _GREASE = 0.02  # Nm s/rad, assumed viscous friction of a gear
 _STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: a sticking joint creeps by less than 1e-3 rad/s
+_FAR = 0.2  # m above the palm, where rays start
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -37,8 +38,8 @@ class Scene:
     model: mujoco.MjModel
     drive_qpos: np.ndarray  # [J]
     drive_dof: np.ndarray  # [J]
-    play_qpos: np.ndarray | None  # [J], None without gear play
-    play_dof: np.ndarray | None  # [J]
+    play_qpos: np.ndarray  # [J]
+    play_dof: np.ndarray  # [J]
     object_qpos: int  # first of seven
     object_dof: int  # first of six
     object_body: int
@@ -47,174 +48,147 @@ class Scene:
     is_object: np.ndarray  # [geoms] bool
 
 
-def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | None, gravity: np.ndarray) -> Scene:
-    """Compile the model of a trial.
-
-    Args:
-      hand: only its geometry, joint ranges and torque limits are used.
-      parameters: of the trial.
-      shape: of the object; None for the hand alone, with a body without geometry in its place.
-      gravity: [3] m/s^2, palm frame.
-
-    Raises:
-      HandError: the hand has coupled joints.
-    """
-    if hand.num_hinges > hand.num_joints:
-        raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    for element in (*spec.actuators, *spec.sensors, *spec.keys):
-        spec.delete(element)
-    spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
-    _place(spec, hand.palm)
-    for body in hand.tip_body:
-        spec.body(hand.body_names[body]).add_site(name=f"{hand.body_names[body]}_taxels")
-    _add_play(spec, hand, parameters)
-    skins = _cover(spec, hand, parameters)
-    add_object(spec, parameters, shape)
-    _add_pairs(spec, shape, parameters, skins)
-    option = spec.option
-    option.timestep, option.gravity = TIMESTEP, gravity
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, float(parameters.cone_ratio)
-    option.solver, option.iterations, option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 30, 1e-9
+def build_scene(hand: HandModel, parameters: TrialParameters, shape: ObjectShape, gravity: np.ndarray) -> Scene:
+    """Compile the model of a trial; `gravity` [3] m/s^2 in the palm frame."""
+    spec = hand.spec.copy()
+    _add_drives(spec, hand, parameters)
+    spec.option.gravity = gravity
+    if hand.foreign:
+        _collide_as_in_the_file(spec, shape)
+    else:
+        tips = [spec.site(name).parent.name for name in hand.lattices]
+        _collide_in_pairs(spec, shape, parameters, tips)
     model = spec.compile()
-    _set_springs(model, parameters, skins)
-    return _index(model, hand)
+    _set_object(model, parameters)
+    scene = _index(model, hand)
+    _set_springs(scene, parameters)
+    return scene
 
 
-def _place(spec: mujoco.MjSpec, palm: str) -> None:
-    """Move the hand so that its palm is the world's origin, wherever its file places it."""
-    root = spec.body(palm)
-    while root.parent != spec.worldbody:
-        root = root.parent
-    root.pos, root.quat, root.alt.type = [0, 0, 0], [1, 0, 0, 0], mujoco.mjtOrientation.mjORIENTATION_QUAT
-    model = spec.compile()
-    data = mujoco.MjData(model)
+def palm_face(scene: Scene, place: tuple[float, ...]) -> float:
+    """Height x in m of a foreign palm's surface at a place (y, z) m along it; 0 where there is none."""
+    model = scene.model
+    data, start = mujoco.MjData(model), np.array([_FAR, *place])
     mujoco.mj_kinematics(model, data)
-    if np.array_equal(data.body(palm).xpos, np.zeros(3)) and np.array_equal(data.body(palm).xquat, [1, 0, 0, 0]):
-        return
-    place = data.body(root.name).xpos, data.body(root.name).xquat
-    for back in (
-        data.body(palm),
-        data.body(root.name),
-    ):  # In its frame F the root belongs at F^-1 X^-1 F, X the palm's.
-        inverse, moved = (np.empty(3), np.empty(4)), (np.empty(3), np.empty(4))
-        mujoco.mju_negPose(*inverse, back.xpos, back.xquat)
-        mujoco.mju_mulPose(*moved, *inverse, *place)
-        place = moved
-    root.pos, root.quat = place
+    geom, down = np.zeros(1, np.int32), np.array([-1.0, 0.0, 0.0])
+    while (distance := mujoco.mj_ray(model, data, start, down, None, 1, -1, geom)) >= 0:
+        start = start + distance * down
+        touches = model.geom_contype[geom[0]] | model.geom_conaffinity[geom[0]]
+        if model.body_weldid[model.geom_bodyid[geom[0]]] == 0 and touches:
+            return float(start[0])
+        start = start + 1e-4 * down  # A finger, or what is only drawn.
+    return 0.0
 
 
-def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> None:
-    for j, name in enumerate(hand.joint_names):
-        drive, strong = spec.joint(name), hand.torque_limit[j] > STRONG
-        drive.armature = float(parameters.rotor_inertia) * ROTORS[0 if strong else 1]
-        drive.damping = _fill(drive.damping, _GREASE + float(parameters.viscous_friction[j]))
+def add_object(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
+    """Add the object as the free body "object", its geoms touching nothing; `_set_object` gives it its mass."""
+    # Not "simple": its centre of mass leaves its frame when `_set_object` moves it.
+    body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0], simple=False)
+    body.add_freejoint(name="object")
+    for k, part in enumerate(shape.parts):
+        size = [*part.size, 0.0, 0.0][:3]
+        body.add_geom(
+            name=f"object_{k}", type=_KINDS[part.kind], size=size, pos=part.place, contype=0, conaffinity=0, density=1.0
+        )
+
+
+def _set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:
+    """Set mass, inertia and centre of the object: a uniform solid (overlaps count twice), and the trial's errors."""
+    body = model.body("object").id
+    scale = parameters.mass / model.body_mass[body]
+    model.body_mass[body] = parameters.mass
+    model.body_inertia[body] *= scale * parameters.inertia_scale
+    model.body_ipos[body] += parameters.com_offset
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _index(model: mujoco.MjModel, hand: HandModel) -> Scene:
+    drives = [model.joint(name) for name in hand.joints]
+    plays = [model.joint(f"{name}_play") for name in hand.joints]
+    free, body = model.joint("object"), model.body("object").id
+    sites = [model.site(name) for name in hand.lattices]
+    # A foreign fingertip may be of several bodies. Of the own hand's last links only the tip has taxels.
+    bodies = model.body_weldid if hand.foreign else np.arange(model.nbody)
+    finger = {int(bodies[site.bodyid[0]]): f for f, site in enumerate(sites)}
+    return Scene(
+        model=model,
+        drive_qpos=np.array([joint.qposadr[0] for joint in drives]),
+        drive_dof=np.array([joint.dofadr[0] for joint in drives]),
+        play_qpos=np.array([joint.qposadr[0] for joint in plays]),
+        play_dof=np.array([joint.dofadr[0] for joint in plays]),
+        object_qpos=int(free.qposadr[0]),
+        object_dof=int(free.dofadr[0]),
+        object_body=body,
+        tip_site=np.array([site.id for site in sites]),
+        finger_of_geom=np.array([finger.get(int(bodies[b]), -1) for b in model.geom_bodyid]),
+        is_object=model.geom_bodyid == body,
+    )
+
+
+def _add_drives(spec: mujoco.MjSpec, hand: HandModel, parameters: TrialParameters) -> None:
+    for j, name in enumerate(hand.joints):
+        drive = spec.joint(name)
+        drive.armature = parameters.rotor_inertia * ROTORS[0 if hand.torque_limit[j] > STRONG else 1]
+        drive.damping = [_GREASE + parameters.viscous_friction[j], 0.0, 0.0]
         drive.frictionloss = 1e-4  # Not 0, so that it has a row in the solver; set at each step.
         drive.solref_friction, drive.solimp_friction[:2] = _STIFF_FRICTION, (0.99, 0.99)
-        half = max(float(parameters.gear_play[j]), 1e-6) / 2
-        play = drive.parent.add_joint(
+        drive.parent.add_joint(
             name=f"{name}_play",
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=drive.axis,
             pos=drive.pos,
-            range=[-half, half],
-            armature=float(parameters.gear_inertia),
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            range=[-1, 1],  # set in `_set_springs`: here its unit would be that of the file
+            armature=parameters.gear_inertia,
+            damping=[2e-4, 0.0, 0.0],
         )
-        play.damping = _fill(play.damping, 2e-4)
 
 
-def _fill(value, number: float):
-    """Damping of a joint, which is a number or the coefficients of a polynomial."""
-    if np.ndim(value) == 0:
-        return number
-    filled = np.zeros_like(value)
-    filled[0] = number
-    return filled
+def _collide_as_in_the_file(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
+    """Add an object that touches every geom of the hand; of its own it adds no friction, stiffness or damping."""
+    bits = functools.reduce(int.__or__, (geom.contype | geom.conaffinity for geom in spec.geoms))
+    lowest = min(geom.priority for geom in spec.geoms)
+    add_object(spec, shape)
+    for geom in spec.body("object").geoms:
+        geom.contype = geom.conaffinity = bits
+        geom.priority, geom.margin, geom.gap = lowest - 1, 0.0, 0.0
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    # What is held falls asleep, and would hang in the air when it is let go.
+    spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
-def _cover(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> dict[str, bool]:
-    """Put rubber on the fingertips; returns the names of the colliding geoms, and whether they have rubber."""
-    tips = {hand.body_names[b] for b in hand.tip_body}
-    names = {}
-    for geom in spec.geoms:
-        touches = bool(geom.contype or geom.conaffinity) and geom.type != mujoco.mjtGeom.mjGEOM_PLANE
+def _collide_in_pairs(spec: mujoco.MjSpec, shape: ObjectShape, parameters: TrialParameters, tips: list[str]) -> None:
+    """Put rubber on the fingertips, and add an object that touches the hand's colliding geoms."""
+    add_object(spec, shape)
+    for geom in [g for g in spec.geoms if g.contype or g.conaffinity]:
         geom.contype = geom.conaffinity = 0
-        if touches:
-            names[geom.name] = geom.parent.name in tips
-            if names[geom.name]:
-                geom.size = [geom.size[0] + float(parameters.rubber), *geom.size[1:]]
-    return names
-
-
-def add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectShape | None) -> None:
-    """Add the object as the free body "object", its geoms touching nothing."""
-    body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0])
-    body.add_freejoint(name="object")
-    if shape is None:
-        body.explicitinertial, body.mass, body.inertia = True, 0.1, [1e-5] * 3
-        return
-    mass, centre, inertia = mass_properties(shape, float(parameters.mass))
-    body.explicitinertial, body.mass, body.ipos = True, mass, centre + parameters.com_offset
-    # Diagonal because of the symmetry of the shapes.
-    body.inertia = np.diag(inertia) * float(parameters.inertia_scale)
-    for k, part in enumerate(shape.parts):
-        body.add_geom(
-            name=f"object_{k}",
-            type=_KINDS[part.kind],
-            size=_three(part.size),
-            pos=part.place,
-            contype=0,
-            conaffinity=0,
-            mass=0,
-        )
-
-
-def _three(size: tuple[float, ...]) -> list[float]:
-    return [*size, 0.0, 0.0][:3]
-
-
-@functools.lru_cache(maxsize=64)
-def _solid(shape: ObjectShape) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre and inertia about the centre of a uniform solid of density 1, from MuJoCo's compiler."""
-    spec = mujoco.MjSpec()
-    body = spec.worldbody.add_body(name="solid")
-    for part in shape.parts:
-        body.add_geom(type=_KINDS[part.kind], size=_three(part.size), pos=part.place, density=1.0)
-    spec.compiler.boundmass = 0
-    model = spec.compile()
-    flat = np.empty(9)
-    mujoco.mju_quat2Mat(flat, model.body_iquat[1])
-    turn = flat.reshape(3, 3)
-    return float(model.body_mass[1]), model.body_ipos[1].copy(), turn @ np.diag(model.body_inertia[1]) @ turn.T
-
-
-def mass_properties(shape: ObjectShape, mass: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass kg, centre [3] m and inertia [3, 3] kg m^2 of a uniform solid of this shape (overlaps count twice)."""
-    volume, centre, inertia = _solid(shape)
-    return mass, centre, inertia * mass / volume
-
-
-def _add_pairs(
-    spec: mujoco.MjSpec, shape: ObjectShape | None, parameters: TrialParameters, skins: dict[str, bool]
-) -> None:
-    for k in range(len(shape.parts) if shape else 0):
-        for name, rubber in skins.items():
-            slide = float(parameters.friction if rubber else parameters.link_friction)
-            twist = float(parameters.torsion) * slide if rubber else 1e-4
-            roll = float(parameters.rolling) * slide if rubber else 1e-5
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            continue
+        slide, twist, roll = parameters.link_friction, 1e-4, 1e-5
+        rubber = geom.parent.name in tips
+        if rubber:
+            geom.size = [geom.size[0] + parameters.rubber, *geom.size[1:]]
+            slide = parameters.friction
+            twist, roll = parameters.torsion * slide, parameters.rolling * slide
+        for k in range(len(shape.parts)):
             spec.add_pair(
-                geomname1=name,
+                geomname1=geom.name,
                 geomname2=f"object_{k}",
                 condim=6 if rubber else 4,
                 friction=[slide, slide, twist, roll, roll],
             )
+    option = spec.option
+    option.timestep, option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, parameters.cone_ratio
+    option.solver, option.iterations, option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 30, 1e-9
 
 
 # --- stiffness -----------------------------------------------------------------------------------
 
 
-def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def spring(
+    inverse_mass: float, stiffness: float, damping: float, step: float = TIMESTEP
+) -> tuple[np.ndarray, np.ndarray]:
     """solref and solimp of a constraint whose force at rest is `stiffness` r, for a penetration r.
 
     A constraint of impedance d and regularisation R = A (1 - d) / d gives a force (d k r + b v + a_0) / (A + R), a_0
@@ -227,12 +201,13 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
       inverse_mass: A in 1/kg (or 1/(kg m^2)), MuJoCo's estimate for the two bodies.
       stiffness: N/m (Nm/rad).
       damping: N s/m (Nm s/rad) for this stiffness.
+      step: s.
     """
-    loss = min(0.5, (0.7 / (damping * inverse_mass * TIMESTEP)) ** 2)
+    loss = min(0.5, (0.7 / (damping * inverse_mass * step)) ** 2)
     loss = max(loss, 0.02)
     impedance = 1 - loss
     soft = inverse_mass * loss / impedance
-    damping = min(damping / loss**0.5, 0.7 / (impedance * soft * TIMESTEP))
+    damping = min(damping / loss**0.5, 0.7 / (impedance * soft * step))
     # In the direct format these are divided by the impedance, the first twice, and d k r has one of its own.
     return (
         np.array([-stiffness * soft * impedance, -damping * soft * impedance]),
@@ -240,76 +215,73 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
     )
 
 
-@functools.lru_cache(maxsize=1)
-def _bounces() -> tuple[np.ndarray, np.ndarray]:
-    """Damping ratios z and their coefficients of restitution, by integrating a bounce.
-
-    x'' + 2 z x' + x = 0 from x' = 1 until the force 2 z x' + x is no longer repulsive.
-    """
-    ratios = np.linspace(0.02, 6.0, 300)
-    position, speed = np.zeros_like(ratios), np.ones_like(ratios)
-    leaving, step = np.zeros_like(ratios), 0.002
-    done = np.zeros(ratios.shape, bool)
-    for _ in range(20000):
-        force = -(2 * ratios * speed + position)
-        now = ~done & (force >= 0) & (speed < 0)
-        leaving[now], done = -speed[now], done | now
-        if done.all():
-            break
-        speed = np.where(done, speed, speed + step * force)
-        position = np.where(done, position, position + step * speed)
-    return ratios, leaving
-
-
 def damping_of(restitution: float, stiffness: float, mass: float) -> float:
-    """Damping N s/m of a contact spring N/m with this coefficient of restitution for a mass in kg."""
-    ratios, outcome = _bounces()
-    ratio = np.interp(restitution, outcome[::-1], ratios[::-1])
-    return float(2 * ratio * np.sqrt(stiffness * mass))
+    """Damping N s/m of a contact spring N/m with this coefficient of restitution for a mass in kg.
+
+    x'' + 2 z x' + x = 0 from x' = 1 until the force is no longer repulsive: the outgoing speed is
+    exp(-2 z arccosh(z) / sqrt(z^2 - 1)), by analytic continuation below z = 1 as well.
+    """
+    ratio = np.linspace(0.025, 6.0, 300, dtype=complex)  # not 1, where it is 0 / 0
+    outgoing = np.exp(-2 * ratio * np.arccosh(ratio) / np.sqrt(ratio**2 - 1)).real
+    return float(2 * np.interp(restitution, outgoing[::-1], ratio.real[::-1]) * np.sqrt(stiffness * mass))
 
 
-def _set_springs(model: mujoco.MjModel, parameters: TrialParameters, skins: dict[str, bool]) -> None:
-    mass, restitution = float(parameters.mass), float(parameters.restitution)
+def _set_springs(scene: Scene, parameters: TrialParameters) -> None:
+    """Set the springs of the contacts in pairs, of the gear plays and of the end stops."""
+    model, step = scene.model, scene.model.opt.timestep
     for p in range(model.npair):
-        ids = (model.pair_geom1[p], model.pair_geom2[p])
-        names = [model.geom(g).name for g in ids]
-        ours = [name for name in names if name in skins]
-        if not any(name.startswith("object_") for name in names):
+        ends = [model.pair_geom1[p], model.pair_geom2[p]]
+        if not scene.is_object[ends].any():  # A pair of the file, of two fingers.
             continue
-        stiffness = float(parameters.stiffness_contact if skins[ours[0]] else parameters.palm_stiffness)
-        inverse_mass = float(model.body_invweight0[model.geom_bodyid[list(ids)], 0].sum())
-        damping = damping_of(restitution, stiffness, mass)
-        model.pair_solref[p], model.pair_solimp[p] = spring(inverse_mass, stiffness, damping)
-    for j in range(model.njnt):
-        if model.joint(j).name.endswith("_play"):
-            inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
-            stiffness = float(parameters.gear_stiffness)
-            model.jnt_solref[j], model.jnt_solimp[j] = spring(
-                inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass)
-            )
-        elif model.jnt_limited[j]:  # the drive's end stops
-            inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
-            model.jnt_solref[j], model.jnt_solimp[j] = spring(
-                inverse_mass, END_STOP, 2 * np.sqrt(END_STOP / inverse_mass)
-            )
+        rubber = scene.finger_of_geom[ends].max() >= 0
+        stiffness = parameters.stiffness_contact if rubber else parameters.palm_stiffness
+        inverse_mass = float(model.body_invweight0[model.geom_bodyid[ends], 0].sum())
+        damping = damping_of(parameters.restitution, stiffness, parameters.mass)
+        model.pair_solref[p], model.pair_solimp[p] = spring(inverse_mass, stiffness, damping, step)
+    half = np.maximum(parameters.gear_play, 1e-6) / 2
+    model.jnt_range[model.dof_jntid[scene.play_dof]] = np.stack([-half, half], -1)
+    for dofs, stiffness in ((scene.play_dof, parameters.gear_stiffness), (scene.drive_dof, END_STOP)):
+        for dof in dofs:
+            inverse_mass, joint = float(model.dof_invweight0[dof]), model.dof_jntid[dof]
+            damping = 2 * np.sqrt(stiffness / inverse_mass)
+            model.jnt_solref[joint], model.jnt_solimp[joint] = spring(inverse_mass, stiffness, damping, step)
 
 
-def _index(model: mujoco.MjModel, hand: Hand) -> Scene:
-    drives = [model.joint(name) for name in hand.joint_names]
-    plays = [model.joint(f"{name}_play") for name in hand.joint_names]
-    tips = [hand.body_names[b] for b in hand.tip_body]
-    finger = {model.body(name).id: f for f, name in enumerate(tips)}
-    free, body = model.joint("object"), model.body("object").id
-    return Scene(
-        model=model,
-        drive_qpos=np.array([j.qposadr[0] for j in drives]),
-        drive_dof=np.array([j.dofadr[0] for j in drives]),
-        play_qpos=np.array([j.qposadr[0] for j in plays]),
-        play_dof=np.array([j.dofadr[0] for j in plays]),
-        object_qpos=int(free.qposadr[0]),
-        object_dof=int(free.dofadr[0]),
-        object_body=body,
-        tip_site=np.array([model.site(f"{name}_taxels").id for name in tips]),
-        finger_of_geom=np.array([finger.get(int(b), -1) for b in model.geom_bodyid]),
-        is_object=model.geom_bodyid == body,
-    )
+# --- contacts ------------------------------------------------------------------------------------
+
+
+class TipContact(NamedTuple):
+    """One contact of object and fingertip; palm frame, forces act on the finger."""
+
+    finger: int
+    point: np.ndarray  # [3] m
+    normal: np.ndarray  # [3] N
+    tangent: np.ndarray  # [3] N
+
+
+def tip_contacts(scene: Scene, data: mujoco.MjData) -> list[TipContact]:
+    """Contacts of the object with the fingertips in the state `data`, from MuJoCo's solver."""
+    contacts, wrench = [], np.zeros(6)
+    for i in range(data.ncon):
+        first, second = data.contact.geom[i]
+        finger = max(scene.finger_of_geom[first], scene.finger_of_geom[second])
+        if finger < 0 or not (scene.is_object[first] or scene.is_object[second]):
+            continue
+        mujoco.mj_contactForce(scene.model, data, i, wrench)
+        # The frame's first row points from the first geom to the second, which feels the force.
+        frame = data.contact.frame[i].reshape(3, 3)
+        sign = 1.0 if scene.is_object[first] else -1.0
+        normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
+        contacts.append(TipContact(int(finger), data.contact.pos[i].copy(), normal, tangent))
+    return contacts
+
+
+def tip_forces(contacts: list[TipContact], fingers: int) -> tuple[np.ndarray, np.ndarray]:
+    """Force [F, 3] N on each fingertip, and its part [F] N along the sum of the fingertip's contact normals."""
+    force, inward = np.zeros((fingers, 3)), np.zeros((fingers, 3))
+    for contact in contacts:
+        force[contact.finger] += contact.normal + contact.tangent
+        inward[contact.finger] += contact.normal
+    # One direction stands for the whole fingertip, as in simulation.
+    length = np.maximum(np.linalg.norm(inward, axis=-1), 1e-12)
+    return force, np.maximum((force * inward).sum(-1) / length, 0.0)

@@ -67,42 +67,36 @@ _DISTANCE = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "capsule": _
 
 def _reach(part: Primitive, direction: np.ndarray) -> float:
     x, y, z = np.abs(direction)
-    size, across = part.size, float(np.hypot(x, y))
-    return float(
-        {
-            "sphere": lambda: size[0],
-            "box": lambda: np.dot(size, (x, y, z)),
-            "cylinder": lambda: size[0] * across + size[1] * z,
-            "capsule": lambda: size[0] + size[1] * z,
-        }[part.kind]()
-    )
+    if part.kind == "box":
+        return float(np.dot(part.size, (x, y, z)))
+    if part.kind == "cylinder":
+        return float(part.size[0] * np.hypot(x, y) + part.size[1] * z)
+    return float(part.size[0] + (part.size[1] * z if part.kind == "capsule" else 0.0))
 
 
 def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: str | None = None) -> ObjectShape:
     """Sample the object of a trial: a cube to rotate; to grasp, one of `SHAPES`, or the named one."""
     which, body = rng.choice(SHAPES), rng.random() < 0.5
     if parameters.task == "rotate":
-        edge = float(parameters.edge) / 2
+        edge = parameters.edge / 2
         return ObjectShape("box", (Primitive("box", (edge, edge, edge)),))
     name = name or str(which)
     half = tuple(float(h) for h in parameters.box_half)
-    tube: tuple[float, ...] = float(parameters.cylinder_radius), float(parameters.cylinder_half)
+    tube = parameters.cylinder_radius, parameters.cylinder_half
     if name == "composition":
         return _composition(parameters, "box" if body else "cylinder", half if body else tube)
-    ball: tuple[float, ...] = (float(parameters.sphere_radius),)
-    size = {"sphere": ball, "box": half, "cylinder": tube, "capsule": tube}[name]
+    size = {"sphere": (parameters.sphere_radius,), "box": half, "cylinder": tube, "capsule": tube}[name]
     return ObjectShape(name, (Primitive(name, size),))
 
 
 def _composition(parameters: TrialParameters, kind: str, size: tuple[float, ...]) -> ObjectShape:
     """A smaller box or cylinder with a capsule along z; the origin is in the middle."""
     body = tuple(BODY_SHARE * s for s in size)
-    neck = float(parameters.neck_radius), float(parameters.neck_half)
+    neck = parameters.neck_radius, parameters.neck_half
     out = body[-1] + neck[1]
     shift = (out + neck[1] + neck[0] - body[-1]) / 2
-    return ObjectShape(
-        "composition", (Primitive(kind, body, (0.0, 0.0, -shift)), Primitive("capsule", neck, (0.0, 0.0, out - shift)))
-    )
+    parts = Primitive(kind, body, (0.0, 0.0, -shift)), Primitive("capsule", neck, (0.0, 0.0, out - shift))
+    return ObjectShape("composition", parts)
 
 
 # --- rotations -----------------------------------------------------------------------------------

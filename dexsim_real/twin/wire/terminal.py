@@ -1,4 +1,4 @@
-"""A pseudo-terminal with a stable name: the emulated device's end of a cable."""
+"""A pseudo-terminal in place of the hand's end of a cable."""
 
 import contextlib
 import os
@@ -9,7 +9,6 @@ from pathlib import Path
 from dexsim_real.core.errors import HandError
 
 _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-_TERMINALS = "/dev/pts/"
 
 
 class Terminal:
@@ -25,7 +24,7 @@ class Terminal:
     def __init__(self, link: Path):
         self.name = Path(link)
         self._master = self._slave = -1
-        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith(_TERMINALS)
+        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
         if self.name.exists() and not ours:
             raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
         self.open()
@@ -48,13 +47,12 @@ class Terminal:
 
     def close(self) -> None:
         """Disconnect: programs that have the terminal open get an error."""
-        if self._master < 0:
-            return
-        with contextlib.suppress(OSError):
-            if self.name.is_symlink() and os.readlink(self.name) == os.ttyname(self._slave):
-                self.name.unlink()
-        os.close(self._master)
-        os.close(self._slave)
+        if self.connected:
+            with contextlib.suppress(OSError):
+                if os.readlink(self.name) == os.ttyname(self._slave):
+                    self.name.unlink()
+            os.close(self._master)
+            os.close(self._slave)
         self._master = self._slave = -1
 
     @property
@@ -77,9 +75,7 @@ class Terminal:
         except BlockingIOError:
             return b""
 
-    def write(self, data: bytes) -> int:
-        """Send bytes; returns how many fit into the buffer of the other side."""
-        try:
-            return os.write(self._master, data)
-        except BlockingIOError:
-            return 0
+    def write(self, data: bytes) -> None:
+        """Send bytes; what nobody reads is lost, as on a wire."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)

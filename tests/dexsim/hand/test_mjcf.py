@@ -13,7 +13,7 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_scene
-from dexsim_real.twin.plant.scene import _place
+from dexsim_real.twin.plant.hand_model import PREFIX, own_model
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
@@ -65,13 +65,11 @@ def test_links_are_in_the_palm_frame_however_the_file_places_the_palm(tmp_path, 
     np.testing.assert_allclose(found.body_position, data.xpos[bodies], atol=1e-6)
     np.testing.assert_allclose(found.body_rotation, data.xmat[bodies].reshape(-1, 3, 3), atol=1e-5)
     # The emulated hand, which shares no code with this one.
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    _place(spec, hand.palm)
-    other = spec.compile()
+    other = own_model(hand).spec.compile()
     data = mujoco.MjData(other)
     mujoco.mj_kinematics(other, data)
-    palm = data.body(hand.palm)
-    np.testing.assert_allclose(np.append(palm.xpos, palm.xquat), [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
+    palm = data.body(PREFIX + hand.palm)
+    np.testing.assert_allclose(np.append(palm.xpos, palm.xmat), [0, 0, 0, *np.eye(3).flat], atol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute")

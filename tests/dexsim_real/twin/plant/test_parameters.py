@@ -15,16 +15,13 @@ from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant import referee, scene
-from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, find_place
-from dexsim_real.twin.plant.mount import nominal_gravity, tilted_gravity
+from dexsim_real.twin.plant import emulated_hand, referee
+from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, nominal_gravity
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import FAR, NEAR, PUSHES, TASKS, bands, sample_trial
-from dexsim_real.twin.plant.shapes import sample_shape
 
 
 def _lookup(config, path):
-    if path == "objects.link_friction" and "link_friction" not in config["objects"]:
-        path = "objects.friction"  # a policy from before the palm had one of its own
     for name in path.split("."):
         config = config[name]
     return config
@@ -32,13 +29,13 @@ def _lookup(config, path):
 
 def trained_bands(task):
     """Those that training has; the others are the emulated hand's own."""
-    return {name: band for name, band in bands(task).items() if not band.own}
+    return {name: band for name, band in bands(task).items() if band.sides != "within"}
 
 
 def test_fingertips_and_friction_follow_nothing_of_training():
     """Their values fill ranges of the emulated hand's own, whatever training has."""
     for task in TASKS:
-        own = {name: band for name, band in bands(task).items() if band.own}
+        own = {name: band for name, band in bands(task).items() if band.sides == "within"}
         assert own.keys() == {"rubber", "friction", "link_friction"}
         drawn = [sample_trial(task, np.random.default_rng(seed)).value for seed in range(100)]
         for name, band in own.items():
@@ -97,14 +94,11 @@ def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_
     assert np.all(np.abs(starts.mean(0) - PLACES["rotate"]) < 0.6 * starts.std(0))
 
 
-def test_the_fingers_leave_room_where_a_cube_is_put(hand):
+def test_the_fingers_leave_room_where_a_cube_is_put(hand, monkeypatch):
     """Hands around which no cube fits are drawn anew, which must not choose among them."""
-    for trial in range(30):
-        rng = np.random.default_rng([7, trial])
-        parameters = sample_trial("rotate", rng, "outside", {})
-        shape = sample_shape(parameters, rng, None)
-        built = scene.build_scene(hand, parameters, shape, tilted_gravity("rotate", parameters.gravity_tilt))
-        assert find_place(built, parameters, shape, rng) is not None
+    monkeypatch.setattr(emulated_hand, "_OBJECTS", 1)
+    for trial in range(15):
+        EmulatedHand(hand, "rotate", 7, first=trial)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -124,23 +118,6 @@ def test_every_value_lies_outside_its_range_and_near_it(task):
         assert sides[name] == {"both": {True, False}, "high": {True}, "low": {False}}[band.sides], name
 
 
-@pytest.mark.parametrize(
-    "name, value, message",
-    [
-        ("edge", 0.0, "edge = 0: must be above 0"),
-        ("mass", -1.0, "mass = -1: must be above 0"),
-        ("taxel_period", 0.0, "taxel_period = 0: must be above 0"),
-        ("camera_delay", -1.0, "camera_delay = -1: must not be negative"),
-        ("friction", -0.5, "friction = -0.5: must not be negative"),
-    ],
-)
-def test_values_that_no_hand_has_are_refused(name, value, message):
-    with pytest.raises(HandError, match=message):
-        sample_trial("rotate", np.random.default_rng(0), overrides={name: value})
-    below = sample_trial("rotate", np.random.default_rng(0), overrides={"gravity_tilt": -0.1, "torque": 0.0})
-    assert (below.gravity_tilt == -0.1).all() and (below.torque == 0).all()
-
-
 def test_inside_nominal_and_overrides():
     for task in TASKS:
         inside, nominal = (sample_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))
@@ -157,8 +134,6 @@ def test_inside_nominal_and_overrides():
         sample_trial("grasp", np.random.default_rng(0), overrides={"friction": "outsid"})
     with pytest.raises(HandError, match="no parameter 'gaer_play'"):
         sample_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
-    with pytest.raises(HandError, match="tasks are"):
-        sample_trial("juggle", np.random.default_rng(0))
 
 
 def test_the_physics_shares_no_code_with_training():
@@ -170,14 +145,9 @@ def test_the_physics_shares_no_code_with_training():
     bridge = {"dexsim_real.wire.frames", "dexsim_real.core.errors", *ours}
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                found = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                assert node.level == 0, f"{path.name}: relative import"
-                found = [f"{node.module}.{alias.name}" for alias in node.names]
-            else:
-                continue
-            for name in found:
+            prefix = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            names = node.names if isinstance(node, (ast.Import, ast.ImportFrom)) else ()
+            for name in (prefix + alias.name for alias in names):
                 package = name.split(".")[0]
                 assert package not in ("jax", "dexsim_ppo", "importlib"), f"{path.name} imports {name}"
                 assert "mjx" not in name

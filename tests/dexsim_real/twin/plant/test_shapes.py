@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dexsim_real.twin.plant import scene, shapes
-from dexsim_real.twin.plant.parameters import BANDS, sample_trial
+from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 
 
@@ -20,7 +20,8 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 )
 def test_distances_agree_with_mujoco(part):
     spec = mujoco.MjSpec()
-    spec.worldbody.add_geom(name="part", type=scene._KINDS[part.kind], size=scene._three(part.size), pos=part.place)
+    size = [*part.size, 0.0, 0.0][:3]
+    spec.worldbody.add_geom(name="part", type=scene._KINDS[part.kind], size=size, pos=part.place)
     for k in range(200):
         spec.worldbody.add_geom(
             name=f"p{k}",
@@ -44,15 +45,16 @@ def test_distances_agree_with_mujoco(part):
 
 
 def test_mass_properties_of_a_box():
-    mass, centre, inertia = scene.mass_properties(ObjectShape("box", (Primitive("box", (0.02, 0.03, 0.04)),)), 0.3)
-    assert mass == 0.3 and centre == pytest.approx(np.zeros(3))
-    assert np.diag(inertia) == pytest.approx(
-        [0.1 * (0.03**2 + 0.04**2), 0.1 * (0.02**2 + 0.04**2), 0.1 * (0.02**2 + 0.03**2)]
-    )
+    spec, half = mujoco.MjSpec(), np.array([0.02, 0.03, 0.04])
+    scene.add_object(spec, ObjectShape("box", (Primitive("box", tuple(half)),)))
+    model, errors = spec.compile(), {"mass": 0.3, "inertia_scale": 1.2, "com_offset": 0.001}
+    scene._set_object(model, sample_trial("grasp", np.random.default_rng(0), overrides=errors))
+    assert model.body_mass[1] == 0.3 and model.body_ipos[1] == pytest.approx(np.full(3, 0.001))
+    square = half**2
+    assert sorted(model.body_inertia[1]) == pytest.approx(sorted(1.2 * 0.1 * (square.sum() - square)))
 
 
 def test_all_shapes_are_drawn():
     parameters = sample_trial("grasp", np.random.default_rng(0))
     drawn = {shapes.sample_shape(parameters, np.random.default_rng(k)).name for k in range(60)}
     assert drawn == set(shapes.SHAPES)
-    assert len(BANDS) > 20

@@ -1,13 +1,10 @@
 """The emulated IMU and camera, read by the bridge's own IMU reader and camera."""
 
 import math
-import struct
 import time
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 pytest.importorskip("serial")
 from twin_line import Running
@@ -20,33 +17,9 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.twin.wire import emulated_sensors
 
 
-def rotation_by_axis(axis, angle):
-    """Rodrigues' formula."""
-    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
-
-
-@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
-def test_an_rvc_frame_says_yaw_pitch_and_roll(yaw, pitch, roll):
-    """Turned about z, then the new y, then the new x; against the bridge's reader as well."""
-    rotation = rotation_by_axis([0, 0, 1], yaw) @ rotation_by_axis([0, 1, 0], pitch) @ rotation_by_axis([1, 0, 0], roll)
-    frame = emulated_sensors.rvc_frame(7, rotation, np.array([0.0, 0.5 * 9.80665, 9.80665]))
-    assert len(frame) == 19 and frame[:3] == b"\xaa\xaa\x07" and sum(frame[2:18]) % 256 == frame[18]
-    words = struct.unpack_from("<6h", frame, 3)
-    np.testing.assert_allclose(words[:3], np.degrees([yaw, pitch, roll]) * 100, atol=0.51)
-    assert words[3:] == (0, 500, 1000)
-    w, x, y, z = imu.decode(frame)
-    read = np.eye(3) + 2 * (
-        w * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        + np.linalg.matrix_power(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), 2)
-    )
-    np.testing.assert_allclose(read, rotation, atol=4e-4)
-
-
-def test_the_bridges_imu_reader_sees_how_the_object_turns(hand, tmp_path):
+def test_the_bridges_imu_reader_sees_how_the_object_turns(tmp_path):
     plant = ScriptedPlant(turn=2.0)
-    with Running(hand, tmp_path, plant, task="rotate") as running:
+    with Running(tmp_path, plant, task="rotate") as running:
         reader = imu.Imu(str(running.twin.imu.terminal.name))
         reader.wait()
         joined = reader.parser.damaged  # The port may be opened within a frame, whose rest can look like a head.
@@ -57,7 +30,7 @@ def test_the_bridges_imu_reader_sees_how_the_object_turns(hand, tmp_path):
             time.sleep(0.02)
             seen.append((plant.time, reader.read()[1]))
         reader.close()
-        sent, passed = running.twin.imu.sent, plant.time
+        sent, passed = running.twin.imu.frames.sent, plant.time
     for when, quat in seen:
         off = 2 * math.acos(min(1.0, abs(quat @ [math.cos(when), math.sin(when), 0, 0])))
         assert off < 0.15  # What it turns in the time that this busy test takes to look.
@@ -71,20 +44,20 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
     place = np.array([0.05, 0.0, 0.09])
     depth = OPTICS.position[1] - place[1]
     ball = emulated_sensors.outline(Primitive("sphere", (0.03,))) + place
-    mask = emulated_sensors.silhouette([ball], OPTICS, (640, 480))
+    mask = emulated_sensors.silhouette([ball], OPTICS)
     # Outline of a sphere seen by a pinhole: a cone of half angle asin(r / d), nearly a circle.
     radius = 600 * math.tan(math.asin(0.03 / math.dist(OPTICS.position, place)))
     assert mask.sum() == pytest.approx(math.pi * radius**2, rel=0.03)
     cube = emulated_sensors.outline(Primitive("box", (0.025, 0.025, 0.025))) + place
-    mask = emulated_sensors.silhouette([cube], OPTICS, (640, 480))
+    mask = emulated_sensors.silhouette([cube], OPTICS)
     side = 600 * 0.05 / (depth - 0.025)  # The near face hides the rest, seen nearly head on.
     assert mask.sum() == pytest.approx(side**2, rel=0.06)
     assert height_of(mask, OPTICS, place, 0) == pytest.approx(0.05, abs=0.001)
     # Half outside of the picture, behind the camera, and on edge.
-    assert 0 < emulated_sensors.silhouette([cube + [0.2, 0, 0]], OPTICS, (640, 480)).sum() < mask.sum()
-    assert not emulated_sensors.silhouette([cube + [0, 0.6, 0]], OPTICS, (640, 480)).any()
+    assert 0 < emulated_sensors.silhouette([cube + [0.2, 0, 0]], OPTICS).sum() < mask.sum()
+    assert not emulated_sensors.silhouette([cube + [0, 0.6, 0]], OPTICS).any()
     flat = cube * [1, 1, 0] + [0, 0, OPTICS.position[2]]
-    assert emulated_sensors.silhouette([flat], OPTICS, (640, 480)).sum() < 100
+    assert emulated_sensors.silhouette([flat], OPTICS).sum() < 100
 
 
 @pytest.mark.parametrize(
@@ -106,8 +79,8 @@ def test_outlines_reach_as_far_as_the_exact_shape(part):
         assert exact - 0.0008 < (points @ way).max() <= exact + 1e-9
 
 
-def test_the_bridges_camera_sees_the_object(hand, tmp_path):
-    with Running(hand, tmp_path, task="grasp", seed=3) as running:
+def test_the_bridges_camera_sees_the_object(tmp_path):
+    with Running(tmp_path, task="grasp", seed=3) as running:
         masks = open_masks(f"unix:{running.twin.masks.path}", OPTICS)
         sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
         until = time.monotonic() + 5
@@ -117,7 +90,7 @@ def test_the_bridges_camera_sees_the_object(hand, tmp_path):
         assert position[0] == pytest.approx(0.047, abs=0.002) and 0 <= time.monotonic() - when < 0.3
         time.sleep(1.0)
         sensor.close()
-        pictures = running.twin.masks.counts["pictures"]
+        pictures = running.twin.masks.sent
         assert 15 < pictures < 60
     with pytest.raises(HandError, match="no program sends masks"):
         open_masks(f"unix:{running.twin.masks.path}", OPTICS)

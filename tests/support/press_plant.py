@@ -1,24 +1,19 @@
 """The emulated hand on a press bench: an emulated person holds a pen in front of the fingertip that is to press.
 
-    python -m dexsim_real.twin --press --parameters outside --seed 3
-
-For `python -m dexsim_real.calibrate`, with the drives, gears and taxels of the trials. The results contain the true
-values that the calibration should find. The pen is across the finger on a block of foam, which yields along its normal
-and, more softly, across it.
+For `dexsim_real.calibrate`, with the drives, gears and taxels of the trials; `truth` is what it should find. The pen
+is across the finger on a block of foam, which yields along its normal and, more softly, across it.
 """
 
-import dataclasses
+import copy
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.plan import Placement, placements
-from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, put
+from dexsim_real.twin.plant.assistant import Stage, put
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.scene import build_scene
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
 from dexsim_real.wire.frames import Mode
 
@@ -26,52 +21,27 @@ _RADIUS = 0.006  # m
 PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
 _AWAY = np.array([0.4, 0.0, 0.0])
 _TOLERANCE = 0.015  # rad, largest distance of targets from the path of a placement
+_STIFFNESS, _SHEAR = 1000.0, 400.0  # N/m of the foam along its normal and across it
+_GAP = 0.002  # m between fingertip and pen at the posture of contact
 _TURN = 0.5  # Nm/rad, rotational stiffness of the foam
 _RATIO = 0.7  # damping ratio of both springs
 _SOLID = {"mass": 0.1, "inertia_scale": 10.0, "com_offset": 0.0}
 
 
-@dataclasses.dataclass(frozen=True)
-class Foam:
-    """The foam that the fingertips press on."""
-
-    stiffness: float = 1000.0  # N/m along the normal
-    shear: float = 400.0  # N/m across it
-    gap: float = 0.002  # m between fingertip and pen at the posture of contact
-
-
-class _Holder(Assistant):
-    """Replaces the assistant: the pen is always there, held by springs."""
-
-    def __init__(self) -> None:
-        self.stage = Stage.FREE
-
-    def begin(self, time: float) -> None:
-        """There is nothing to wait for."""
-
-
 class PressBench(EmulatedHand):
-    """An emulated hand with a pen on foam as its object, and one trial without end.
+    """A hand with a pen on foam as its object, and one trial without end."""
 
-    Args:
-      hand: model of the hand.
-      seed: of all random numbers.
-      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
-      overrides: fixed parameters (`sample_trial`).
-      foam: its stiffness and place.
-    """
-
-    def __init__(
-        self,
-        hand: Hand,
-        seed: int = 0,
-        *,
-        kind: str = "outside",
-        overrides: dict[str, float] | None = None,
-        foam: Foam = Foam(),
-    ):
-        self._plan, self._foam = placements(hand), foam
-        super().__init__(hand, "grasp", seed, kind=kind, overrides={**_SOLID, **(overrides or {})})
+    def __init__(self, hand, seed=0, kind="outside"):
+        super().__init__(hand, "grasp", seed, kind=kind, overrides=_SOLID)
+        self._plan, self._assistant.stage = placements(hand), Stage.FREE
+        skin, noise = copy.copy(self._skin), self._noise
+        self._enter(self._draw(self.parameters, PEN), np.random.default_rng(seed))
+        self._skin, self._noise = skin, noise  # It is still the hand of the first trial.
+        self._probe = mujoco.MjData(self._scene.model)
+        self._pressing_placement: Placement | None = None
+        self._remove()
+        mujoco.mj_forward(self._scene.model, self._data)
+        self._remember()
 
     def gauge(self) -> float:
         """Force N of the pen on the foam along its normal, as a perfect scale under it shows."""
@@ -95,40 +65,22 @@ class PressBench(EmulatedHand):
             "taxel_gain": parameters.taxel_gain.tolist(),
         }
 
-    # --- the pen --------------------------------------------------------------------------------
-
-    def _next_trial(self) -> None:
-        super()._next_trial()
-        self.shape, self._assistant = PEN, _Holder()
-        self._scene = scene = build_scene(self.hand, self.parameters, PEN, self._gravity)
-        joints = self._data.qpos[scene.drive_qpos].copy()
-        self._data = mujoco.MjData(scene.model)
-        self._data.qpos[scene.drive_qpos] = joints
-        self._probe = mujoco.MjData(scene.model)
-        self._pressing_placement: Placement | None = None
-        self._remove()
-        mujoco.mj_forward(scene.model, self._data)
-        self._past.clear()
-        self._samples.clear()
-        self._remember()
-
-    def _tick(self) -> None:
+    def _before(self) -> None:
         """Apply the springs that hold the pen."""
-        scene, data, foam = self._scene, self._data, self._foam
-        at, dof, mass = scene.object_qpos, scene.object_dof, float(self.parameters.mass)
-        shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
+        scene, data = self._scene, self._data
+        at, dof, mass = scene.object_qpos, scene.object_dof, self.parameters.mass
+        shift, speed = data.qpos[at : at + 3] - self._place[0], data.qvel[dof : dof + 3]
         along = np.outer(self._facing, self._facing)
         across = np.eye(3) - along
-        force = -(foam.stiffness * along + foam.shear * across) @ shift
-        force -= 2 * _RATIO * (np.sqrt(foam.stiffness * mass) * along + np.sqrt(foam.shear * mass) * across) @ speed
+        force = -(_STIFFNESS * along + _SHEAR * across) @ shift
+        force -= 2 * _RATIO * (np.sqrt(_STIFFNESS * mass) * along + np.sqrt(_SHEAR * mass) * across) @ speed
         skew = np.empty(3)
-        mujoco.mju_subQuat(skew, data.qpos[at + 3 : at + 7], self._place.quat)
+        mujoco.mju_subQuat(skew, data.qpos[at + 3 : at + 7], self._place[1])
         inertia = float(scene.model.body_inertia[scene.object_body].max())
         torque = -_TURN * skew - 2 * _RATIO * np.sqrt(_TURN * inertia) * data.qvel[dof + 3 : dof + 6]
         wrench = data.xfrc_applied[scene.object_body]
         wrench[:3], wrench[3:] = force - mass * self._gravity, matrix(data.qpos[at + 3 : at + 7]) @ torque
         self._spring = force
-        super()._tick()
 
     def _look(self) -> None:
         """Hold the pen in front of the fingertip that is about to press."""
@@ -176,14 +128,14 @@ class PressBench(EmulatedHand):
         touching = np.union1d(model.pair_geom1, model.pair_geom2)
         tips = touching[self._scene.finger_of_geom[touching] == finger]
         gap = min(mujoco.mj_geomDistance(model, probe, int(tip), pen, 0.1, None) for tip in tips)
-        self._put(point + (_RADIUS + far - gap + self._foam.gap) * self._facing, quat)
+        self._put(point + (_RADIUS + far - gap + _GAP) * self._facing, quat)
 
     def _remove(self) -> None:
         self._pressing_placement, self._facing = None, np.array([0.0, 0.0, 1.0])
         self._put(_AWAY, np.array([1.0, 0.0, 0.0, 0.0]))
 
     def _put(self, position: np.ndarray, quat: np.ndarray) -> None:
-        self._place, self._spring = Place(position, quat, np.zeros(3)), np.zeros(3)
+        self._place, self._spring = (position, quat), np.zeros(3)
         put(self._scene, self._data, position, quat)
 
 
@@ -194,3 +146,10 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([normal, y, np.cross(normal, y)], 1).ravel())
     return quat
+
+
+if __name__ == "__main__":  # The emulated hand's command, on the press bench.
+    from dexsim_real.twin import __main__ as command
+
+    command.make_plant = lambda arguments, hand: PressBench(hand, arguments.seed, arguments.parameters)
+    command.main()

@@ -1,0 +1,237 @@
+"""The body of the emulated hand: links, inertias and geoms from an MJCF, in the palm frame.
+
+The hand's own MJCF (`own_model`), or one by somebody else (`read_model`), which need not have its names: joints are
+found by name, or by the order of the actuators; the palm is the body that carries all of them; a fingertip is the site
+on the body that the finger's last joint moves. A TOML says what cannot be found:
+
+    model = "my_hand.xml"
+    palm = "base"                  # body or site: fingers along z, palm normal x, thumb side y
+    joints = ["j0", ..., "j11"]    # in the order of the hand
+    tips = ["tip_0", ..., "tip_4"] # sites at the tips, in the order of the fingers
+"""
+
+import dataclasses
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+
+PREFIX = "plant/"  # of all names of the MJCF
+_RANGE = 0.05  # rad, largest difference of an end of a joint's range
+_APART = 0.015  # m, largest distance of a fingertip from where the hand has it
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position [3] m and rotation [3, 3]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HandModel:
+    """A hand in the palm frame, without actuators; J joints and F fingers in the order of the hand."""
+
+    name: str
+    spec: mujoco.MjSpec
+    joints: list[str]  # [J]
+    torque_limit: np.ndarray  # [J] Nm
+    lattices: list[str]  # [F] sites: the frames in which the hand gives the taxels of a fingertip
+    foreign: bool = False  # contacts, friction, time step and solver are those of the file
+
+
+@dataclasses.dataclass(frozen=True)
+class _Names:
+    """What a TOML may say."""
+
+    model: str
+    palm: str = ""
+    joints: tuple[str, ...] = ()
+    tips: tuple[str, ...] = ()
+
+
+def own_model(hand: Hand) -> HandModel:
+    """The hand's own MJCF; its collisions, options and motors are left out.
+
+    Raises:
+      HandError: the hand has coupled joints.
+    """
+    if hand.num_hinges > hand.num_joints:
+        raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
+    spec = mujoco.MjSpec.from_file(str(hand.model_path))
+    _delete(spec, *spec.actuators, *spec.sensors, *spec.keys)
+    spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
+    lattices = [f"{hand.body_names[body]}_taxels" for body in hand.tip_body]
+    for name in lattices:
+        spec.body(name.removesuffix("_taxels")).add_site(name=name)
+    data = mujoco.MjData(spec.compile())
+    mujoco.mj_kinematics(data.model, data)
+    palm = data.body(hand.palm)
+    spec = _in_palm_frame(spec, (palm.xpos, palm.xmat.reshape(3, 3)))
+    return HandModel("emulated hand", spec, _prefixed(hand.joint_names), hand.torque_limit, _prefixed(lattices))
+
+
+def read_model(path: str | Path, hand: Hand) -> HandModel:
+    """Read and check an MJCF by somebody else.
+
+    Args:
+      path: the MJCF, or a TOML that names it and its parts.
+      hand: whose joints, fingertips and taxels it must have.
+
+    Raises:
+      HandError: it cannot be read, or does not fit the hand.
+    """
+    path = Path(path)
+    try:
+        names = _Names(**tomllib.loads(path.read_text())) if path.suffix == ".toml" else _Names(path.name)
+        spec = mujoco.MjSpec.from_file(str(path.parent / names.model))
+        _leave_out_scenery(spec)
+        model = spec.compile()
+        joints = _find_joints(model, hand, names.joints)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        palm = _find_palm(data, joints, names.palm)
+        tips = [_find_tip(model, hand, joints, finger, names.tips) for finger in range(hand.num_fingers)]
+        _check_places(model, hand, joints, palm, tips)
+    except (OSError, ValueError, TypeError) as error:
+        raise HandError(f"{path}: {' '.join(str(error).split())[:300]}") from None
+    lattices = _add_lattices(spec, data, hand, palm, tips)
+    _delete(spec, *spec.actuators)
+    spec, drives = _in_palm_frame(spec, palm), _prefixed(model.joint(joint).name for joint in joints)
+    return HandModel(path.name, spec, drives, hand.torque_limit, _prefixed(lattices), foreign=True)
+
+
+def _in_palm_frame(spec: mujoco.MjSpec, palm: Pose) -> mujoco.MjSpec:
+    """The same model with its palm as the world's frame, and prefixed names."""
+    place, turn = palm
+    quat, world = np.empty(4), mujoco.MjSpec()
+    mujoco.mju_mat2Quat(quat, turn.T.ravel())
+    world.option = spec.option
+    world.attach(spec, frame=world.worldbody.add_frame(pos=-turn.T @ place, quat=quat), prefix=PREFIX)
+    return world
+
+
+def _prefixed(names: Iterable[str]) -> list[str]:
+    return [PREFIX + name for name in names]
+
+
+# --- reading: ValueError where the file does not fit ---------------------------------------------
+
+
+def _delete(spec: mujoco.MjSpec, *elements: object) -> None:
+    for element in elements:
+        spec.delete(element)
+
+
+def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
+    """Delete floors and loose objects, which would be in the way of the trial's, and what may refer to them."""
+    loose = [body for body in spec.worldbody.bodies if [j.type for j in body.find_all("joint")] == [_FREE]]
+    floors = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    gone = {geom.name for geom in (*floors, *(g for body in loose for g in body.find_all("geom")))}
+    pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & gone]
+    _delete(spec, *spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples, *pairs, *floors, *loose)
+
+
+def _find_joints(model: mujoco.MjModel, hand: Hand, given: tuple[str, ...]) -> list[int]:
+    """The named joints, those with the hand's names, or those with an actuator; in the order of the hand."""
+    hinges = {model.joint(j).name: j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE}
+    driven = [model.joint(int(joint)).name for joint in model.actuator_trnid[:, 0]]
+    names = given or (hand.joint_names if set(hand.joint_names) <= hinges.keys() else tuple(driven))
+    if len(set(names)) != hand.num_joints or set(names) - hinges.keys():
+        raise ValueError(f"{len(set(names))} joints, the hand has {hand.num_joints}; hinges are {', '.join(hinges)}")
+    for name, end, low, high in zip(names, hand.joint_names, hand.joint_lower, hand.joint_upper, strict=True):
+        joint = hinges[name]
+        limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.array([-np.inf, np.inf])
+        if np.abs(limits - (low, high)).max() > _RANGE:
+            raise ValueError(
+                f"joint {name} has a range of {limits[0]:.3f} to {limits[1]:.3f} rad, {end} of the hand {low:.3f} to "
+                f"{high:.3f}"
+            )
+    return [hinges[name] for name in names]
+
+
+def _find_palm(data: mujoco.MjData, joints: list[int], given: str) -> Pose:
+    """The palm frame in the world: that of a body or site, or of the body that carries all joints."""
+    model = data.model
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, given)
+    body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, given)
+    if not given:  # The deepest that carries all: a body comes after its parent.
+        body = max(set.intersection(*(_carriers(model, int(model.jnt_bodyid[joint])) for joint in joints)))
+    if body < 0:
+        raise ValueError(f"palm: there is neither a body nor a site {given!r}")
+    if model.body_weldid[body] != 0:
+        raise ValueError(f"the palm ({model.body(body).name}) moves: fix it to the world")
+    frame = data.site(site) if site >= 0 else data.body(body)
+    return frame.xpos.copy(), frame.xmat.reshape(3, 3).copy()
+
+
+def _carriers(model: mujoco.MjModel, body: int) -> set[int]:
+    """Bodies that carry a body, up to the world."""
+    bodies = set()
+    while body:
+        body = int(model.body_parentid[body])
+        bodies.add(body)
+    return bodies
+
+
+def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, given: tuple[str, ...]) -> int:
+    """The site at the tip of a finger: the named one, the only one, or the one with "tip" in its name."""
+    body = int(hand.tip_body[finger])
+    while hand.body_joint[body] < 0:
+        body = int(hand.body_parent[body])
+    joint = joints[int(hand.body_joint[body])]
+    moved = model.body_weldid[model.jnt_bodyid[joint]]
+    sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == moved]
+    if given:
+        sites = [site for site in sites if model.site(site).name in given]
+    elif len(sites) > 1:
+        sites = [site for site in sites if "tip" in model.site(site).name.lower()]
+    if len(sites) != 1:
+        raise ValueError(
+            f"{len(sites)} fingertip sites of {hand.finger_names[finger]}: put one site with 'tip' in its name on the "
+            f"body that {model.joint(joint).name} moves, at the tip"
+        )
+    return sites[0]
+
+
+def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Pose, tips: list[int]) -> None:
+    """Check where the fingertips are with all joints at 0, and with each at its upper end."""
+    data = mujoco.MjData(model)
+    for j in range(-1, hand.num_joints):
+        posture = np.where(np.arange(hand.num_joints) == j, hand.joint_upper, 0.0)
+        data.qpos[model.jnt_qposadr[joints]] = posture
+        mujoco.mj_kinematics(model, data)
+        apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - _hand_tips(hand, posture)[0], axis=-1)
+        if not apart.max() <= _APART:
+            where = f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad" if j >= 0 else "all joints at 0"
+            raise ValueError(
+                f"with {where} the tip of {hand.finger_names[apart.argmax()]} is {1e3 * apart.max():.0f} mm from where "
+                "the hand has it: check palm frame, and order, axes and zeros of the joints"
+            )
+
+
+def _hand_tips(hand: Hand, posture: np.ndarray) -> Pose:
+    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's own MJCF."""
+    data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
+    for name, angle in zip(hand.joint_names, posture, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(data.model, data)
+    palm, bodies = data.body(hand.palm), [data.model.body(hand.body_names[body]).id for body in hand.tip_body]
+    frame = palm.xmat.reshape(3, 3)
+    turns = frame.T @ data.xmat[bodies].reshape(-1, 3, 3)
+    return (data.xpos[bodies] - palm.xpos) @ frame + np.einsum("fij,fj->fi", turns, hand.tip_offset), turns
+
+
+def _add_lattices(spec: mujoco.MjSpec, data: mujoco.MjData, hand: Hand, palm: Pose, tips: list[int]) -> list[str]:
+    """Add the frames of the taxels: at the tip sites, turned as on the hand with all joints at 0 (as in `data`)."""
+    turns = palm[1] @ _hand_tips(hand, np.zeros(hand.num_joints))[1]
+    names = [f"lattice_{finger}" for finger in hand.finger_names]
+    for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
+        body, quat = int(data.model.site_bodyid[site]), np.empty(4)
+        frame = data.xmat[body].reshape(3, 3)
+        mujoco.mju_mat2Quat(quat, (frame.T @ turn).ravel())
+        place = frame.T @ (data.site_xpos[site] - turn @ offset - data.xpos[body])
+        spec.bodies[body].add_site(name=name, pos=place, quat=quat)
+    return names
