@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         find_task(arguments.task)
     file = checkpoint.load(arguments.file, kind="train")
     saved = default_arguments(None, "auto", file)
-    env, config = make_environment(saved, find_hand(saved, file), 1), saved.ppo
+    env, config = make_environment(saved, find_hand(saved, file)), saved.ppo
     training = make_train(env, dataclasses.replace(config, iterations_per_call=1), saved.curriculum)
     restored = checkpoint.restore(file, training.shapes(jax.random.key(saved.seed)))
     state: TrainState = jax.tree.map(jnp.copy, restored)

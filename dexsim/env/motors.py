@@ -15,8 +15,8 @@ from dexsim.physics.interface import PhysicsState, TorqueLaw
 from dexsim.physics.physics import Physics
 from dexsim.randomization import HandParams, Randomization
 
-# s, in which Coulomb friction stops a joint: `apply_friction`'s dt. With the sub-step in its place forces of grips would
-# hang on the sub-step, since friction creeps under a contact's load at load dt / I: by .19 N (median) from 1 to 10 ms.
+# s, in which Coulomb friction stops a joint: `apply_friction`'s dt. Were it the sub-step, forces of grips would depend on
+# the sub-step, since friction creeps at load dt / I under a contact's load: by .19 N (median) from 1 to 10 ms.
 _STOPPING = 0.006
 
 
@@ -73,14 +73,15 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
     """Check that the stiffest motors that are drawn are stable at the time step, on every engine.
 
     Engines step v' = v + h/I (-k_p q - k_d (v + v') / 2 - d v), q' = q + h v', with the joint's own damping d explicit.
-    With a = h^2 k_p / I, b = h k_d / I and c = h d / I the step is a matrix of determinant (1 - b/2 - c) / (1 + b/2) and
-    trace 1 + determinant - a / (1 + b/2). Both eigenvalues are inside the unit circle if and only if a + 2 c < 4, or
+    With a = h^2 k_p / I, b = h k_d / I and c = h d / I the step is a matrix of determinant (1 - b/2 - c) / (1 + b/2)
+    and trace 1 + determinant - a / (1 + b/2). Both eigenvalues are inside the unit circle if and only if a + 2 c < 4:
 
         h^2 k_p / I + 2 h d / I < 4,
 
     whatever the motor's damping k_d. For all joints at once I is the mass matrix, and the left side the largest
-    eigenvalue of M^-1 (h^2 K_p + 2 h D). Beyond it a joint chatters from limit to limit of its torque. `Randomization.beyond`, for hands that training never
-    has, is not counted; nor are friction and dead-band, which damp.
+    eigenvalue of M^-1 (h^2 K_p + 2 h D). Beyond it a joint chatters from limit to limit of its torque.
+    `Randomization.beyond`, for hands that training never has, is not counted; nor are friction and dead-band, which
+    damp.
 
     Raises:
       ConfigError: names the joint and the largest stable time step.

@@ -56,14 +56,14 @@ _CALLS = ("jit", "pjit", "custom_jvp_call", "custom_vjp_call", "closed_call")
 def implicit(law: TorqueLaw, timestep: float) -> ImplicitLaw:
     """Motors whose damping acts at the middle of a sub-step, within the engine's solver.
 
-    A torque of the start of a sub-step makes stiff motors chatter: at 8 ms a fifth of all hands that are drawn. To first
+    With the torque of a sub-step's start stiff motors chatter: at 8 ms a fifth of all hands that are drawn. To first
     order the torque at the mean speed of the sub-step, v + h a / 2, is
 
         tau(q, v) - (h k_d / 2) a,    k_d = -d tau / d v.
 
     The last term goes to the left of M a = tau + contacts as an inertia. The solver so finds motors and contacts
-    together, and a stalled motor, whose speed and slope are zero, keeps its torque: with 10 ms forces of grips are those
-    of 1 ms. A slope that would destabilise (a torque limit that falls with speed, driven back) is left explicit.
+    together, and a stalled motor, whose speed and slope are zero, keeps its torque: with 10 ms, forces of grips are
+    those of 1 ms. A slope that would destabilise (a torque limit that falls with speed, driven back) is left explicit.
 
     Args:
       law: joint by joint: the torque of a joint depends on its own angle and speed alone.
