@@ -15,8 +15,8 @@ from dexsim.physics.interface import PhysicsState, TorqueLaw
 from dexsim.physics.physics import Physics
 from dexsim.randomization import HandParams, Randomization
 
-# s, in which Coulomb friction stops a joint: `apply_friction`'s dt. Were it the sub-step, forces of grips would depend on
-# the sub-step, since friction creeps at load dt / I under a contact's load: by .19 N (median) from 1 to 10 ms.
+# s, in which Coulomb friction stops a joint: `apply_friction`'s dt. Were it the sub-step, forces of grips would depend
+# on it, since friction creeps at load dt / I under a load of a contact: by .19 N (median) from 1 to 10 ms.
 _STOPPING = 0.006
 
 
