@@ -92,7 +92,7 @@ class CBackend:
 
 
 def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'c' has no gradient: make the environment with backend='mjx'")
+    raise ConfigError("backend 'c' has no gradient")
 
 
 class _Worlds:

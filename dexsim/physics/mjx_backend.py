@@ -1,7 +1,7 @@
-"""MuJoCo's own `mjx.step`: any device, with gradients.
+"""MuJoCo's own `mjx.step`: any device.
 
-`jax.jvp` and `jax.jacfwd` go through it. MJX's solver is a loop without a reverse unless it is one iteration long, so
-`jax.grad` needs `PhysicsConfig.iterations` 1.
+No gradients through contacts: MJX's solver is a loop without a reverse mode unless it is one iteration long, and its
+forward mode gave NaN in a grip.
 """
 
 from typing import Any

@@ -1,8 +1,7 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
 `advance` runs the scene for one control tick. Backends are `c` (C MuJoCo on the CPU's cores), `cuda` (one kernel for a
-tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device, with gradients), which is not imported before a scene
-is compiled.
+tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device), which is not imported before a scene is compiled.
 """
 
 from collections.abc import Callable

@@ -87,4 +87,4 @@ class CudaBackend:
 
 
 def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'cuda' has no gradient: make the environment with backend='mjx'")
+    raise ConfigError("backend 'cuda' has no gradient")

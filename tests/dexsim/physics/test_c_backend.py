@@ -276,7 +276,7 @@ def test_a_gradient_is_refused_by_name(physics, grips):
     def height(push):
         return physics.advance(hold, row0(target), row0(state), push)[0].qpos[12]
 
-    with pytest.raises(ConfigError, match="backend='mjx'"):
+    with pytest.raises(ConfigError, match="no gradient"):
         jax.grad(height)(jnp.zeros(3))
     assert np.isfinite(jax.jit(height)(jnp.zeros(3)))
 
