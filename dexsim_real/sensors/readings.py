@@ -60,4 +60,4 @@ def make_readings(
         "past_actions": actions[1:],
         "palm_gravity": estimate.palm_gravity,
     }
-    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})
+    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})  # type: ignore[arg-type]
