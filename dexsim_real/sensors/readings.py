@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -60,4 +61,5 @@ def make_readings(
         "past_actions": actions[1:],
         "palm_gravity": estimate.palm_gravity,
     }
-    return Readings(**{name: np.asarray(value, np.float32) for name, value in values.items()})  # type: ignore[arg-type]
+    arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in values.items()}
+    return Readings(**arrays)
