@@ -21,7 +21,6 @@ class ObjectSensors:
 
     @property
     def measures_orientation(self) -> bool:
-        """Whether there is an IMU."""
         return self._imu is not None
 
     def ready(self) -> bool:
