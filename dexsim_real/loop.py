@@ -1,8 +1,8 @@
 """The exchange loop with a hand: decide, send, sense, judge.
 
 There is one. A run on a hand is this loop in a thread of its own (`LoopThread`), a calibration steps it from its
-procedure (`calibrate.bench`), and a run in virtual time lets the time pass between `request` and `take`
-(`twin.virtual`).
+procedure (`calibrate.bench`), and a run in virtual time gives it a port whose waiting
+passes the time (`twin.virtual`).
 """
 
 import contextlib
