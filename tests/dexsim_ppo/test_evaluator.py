@@ -101,7 +101,7 @@ def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_
     for options, words in {
         ("--output", "x.mp4", "--video", "./x.mp4"): "--video .*x.mp4: is the file of --output",
         ("--output", name): f"--output {name}: is the policy",
-        ("--episodes", "2000000"): "--episodes 2000000: must be between 0 and 1000000",
+        ("--episodes", "2000000"): "EvaluateArguments.episodes = 2000000: must be between 0 and 1000000",
     }.items():
         with pytest.raises(ConfigError, match=f"^{words}"):
             evaluate.main([name, *options])

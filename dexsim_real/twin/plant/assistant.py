@@ -129,16 +129,20 @@ class Assistant:
     Args:
       task: "grasp" or "rotate".
       patience: s after which a runner that does not return to the start posture gets its object where it is.
+
+    Attributes:
+      reaction: s from the first motion of the targets to the release, a person's.
     """
 
     def __init__(self, task: str, patience: float = 15.0):
-        self._posture, self._patience = np.array(POSTURES[task]), patience
+        self._posture, self._patience, self.reaction = np.array(POSTURES[task]), patience, 0.0
         self.begin(0.0)
 
     def begin(self, time: float) -> None:
         """Take the object away at a time in s, and wait for the hand."""
         self.stage, self._since, self._on = Stage.AWAY, time, False
         self._held: float | None = None
+        self._left: float | None = None
 
     def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, is_clear: Callable[[], bool]) -> Stage:
         """Update the stage.
@@ -162,8 +166,11 @@ class Assistant:
                 self.stage, self._held = Stage.HOLD, None
             elif time - self._since > self._patience and is_clear():
                 self.stage, self._held = Stage.HOLD, time
-        elif self._held is None and off > _LEFT or self._held is not None and time - self._held > _HAND_OVER:
-            self.stage = Stage.FREE
+        elif self._held is not None:
+            self.stage = Stage.FREE if time - self._held > _HAND_OVER else Stage.HOLD
+        elif off > _LEFT or self._left is not None:
+            self._left = time if self._left is None else self._left
+            self.stage = Stage.FREE if time - self._left >= self.reaction else Stage.HOLD
         return self.stage
 
     def shelf(self, place: Place) -> np.ndarray:

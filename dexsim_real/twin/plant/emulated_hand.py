@@ -206,6 +206,7 @@ class EmulatedHand:
             raise HandError(f"trial {self.trial}: none of {_OBJECTS} objects had room in the hand's start posture")
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
+        self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
         self._referee = Referee(self.task, self._seconds)
         put(scene, self._data, self._assistant.shelf(place), place.quat)
         mujoco.mj_forward(scene.model, self._data)

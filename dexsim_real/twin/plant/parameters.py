@@ -109,6 +109,7 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
         "neck_half": Band(0.008, 0.018, "m", "objects.neck_half", 0.013),
         "gap": Band(0.001, 0.009, "m", "release_gap", 0.005, "trial", "high"),
         "release_speed": Band(0.0, 0.1, "m/s", "release_speed", 0.0, "trial", "high"),
+        "reaction": Band(0.1, 0.5, "s", "release_delay", 0.3, sides="within"),
     },
     "rotate": {
         "mass": Band(0.06, 0.15, "kg", "objects.mass", 0.10),

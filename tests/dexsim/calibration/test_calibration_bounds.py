@@ -137,7 +137,7 @@ def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
 
 
 def test_an_endless_file_ends(hand):
-    with pytest.raises(CalibrationError, match="/dev/zero: damaged.*larger than 128 KiB"):
+    with pytest.raises(CalibrationError, match="/dev/zero: damaged.*larger than 1 MiB"):
         load_calibration("/dev/zero", hand)
 
 

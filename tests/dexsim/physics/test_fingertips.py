@@ -70,6 +70,7 @@ def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
 def test_index_and_middle_finger_stop_each_other(hand):
     """The index finger swings into the middle one at full torque, and then rests on it."""
     model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c").model
+    model.opt.timestep = 0.005  # s; the motors below are explicit
     data = mujoco.MjData(model)
     names = list(hand.joint_names)
     bend, angle = names.index("index_bend"), np.where(np.arange(12) < 3, 0.0, 0.3)

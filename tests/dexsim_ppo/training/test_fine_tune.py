@@ -123,8 +123,8 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
             ["--policy", "other.msgpack"],
             "the policy expects position_2 [1]",
         ),
-        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "--ppo.actor-layers (7,): the policy has"),
-        (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "--ppo.memory gru: the policy has none"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "actor_layers = (7,): the policy has"),
+        (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "memory = gru: the policy has none"),
     ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
         error = capsys.readouterr().err

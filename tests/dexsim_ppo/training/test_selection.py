@@ -80,21 +80,21 @@ def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
     assert evaluate(run, monkeypatch, nan, 3.0, nan, 2.0, 4.0) == [0, 1, 4]
 
 
-@pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
-def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monkeypatch):
-    """Not of training's corners; and Warp's buffers are of the batch's size."""
+@pytest.mark.parametrize("own", [False, True])
+def test_an_evaluation_is_of_the_task_as_configured(own, tmp_path, monkeypatch):
+    """Not of training's corners."""
     import dexsim
 
     made = []
     monkeypatch.setattr(dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv(), raising=False)
     env = TinyEnv()
-    env.backend, env.hand = backend, "the hand"
+    env.backend, env.hand = "c", "the hand"
     arguments = dataclasses.replace(ARGUMENTS, evaluation_chunk=6)
-    if own and backend == "jax":
+    if own:
         monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
     run = Run(env, arguments, RunFolder(tmp_path), 0.0)
     if own:
-        options = {"backend": backend, "num_envs": 6, "hand": "the hand"}
+        options = {"backend": "c", "hand": "the hand"}
         assert made == [(("tiny", arguments.env), options)] and run.evaluator.env is not env
     else:
         assert not made and run.evaluator.env is env

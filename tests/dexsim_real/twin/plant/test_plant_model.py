@@ -173,7 +173,7 @@ def test_a_contact_loads_the_nearest_taxels_with_all_of_its_force(hand):
 
 
 def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand):
-    ours = plant(hand, task="grasp")
+    ours = plant(hand, task="grasp", reaction=0.0)
     posture = np.array(POSTURES["grasp"])
     ours.drive(motors(posture))
     ours.advance(0.6)
