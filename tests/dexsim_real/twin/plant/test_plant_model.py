@@ -32,10 +32,10 @@ def write(tmp_path):
     return write
 
 
-def plant(hand, path=None, task="rotate", **overrides):
-    path = path or asset_path("plants/foreign_right.xml")
-    calm = {"push_rate": 0.0, "sensing_latency": 0.0}
-    return EmulatedHand(hand, task, 0, kind="nominal", overrides=QUIET | IDEAL | calm | overrides, plant_model=path)
+def plant(hand, path=None, task="rotate", shape=None, **overrides):
+    path, values = path or asset_path("plants/foreign_right.xml"), QUIET | IDEAL | overrides
+    values |= {"push_rate": 0.0, "sensing_latency": 0.0}
+    return EmulatedHand(hand, task, 0, kind="nominal", overrides=values, shape=shape, plant_model=path)
 
 
 def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
@@ -173,7 +173,7 @@ def test_a_contact_loads_the_nearest_taxels_with_all_of_its_force(hand):
 
 
 def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand):
-    ours = plant(hand, task="grasp", reaction=0.0)
+    ours = plant(hand, task="grasp", shape="box", reaction=0.3)
     posture = np.array(POSTURES["grasp"])
     ours.drive(motors(posture))
     ours.advance(0.6)
