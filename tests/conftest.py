@@ -147,11 +147,11 @@ def hand() -> Any:
 
 @pytest.fixture(scope="session")
 def grasp_env() -> Any:
-    """The grasp task on C MuJoCo: the defaults, but for a small pool (16 of each shape)."""
+    """The grasp task on C MuJoCo: the defaults, but for a small pool (16 of each shape) of objects let go at once."""
     import dexsim
     from dexsim.tasks.grasp.config import GraspConfig
 
-    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
+    return dexsim.make("grasp", GraspConfig(pool_size=80, release_delay=(0.0, 0.0)), backend="c")
 
 
 @pytest.fixture(scope="session")

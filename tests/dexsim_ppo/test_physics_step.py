@@ -11,13 +11,15 @@ from dexsim.core.compilation import jit
 from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.physics import Physics
+from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy
 
 WORLDS, CLOSING, HOLDING = 16, 40, 8  # control ticks
 
 
 def test_forces_at_the_default_step_are_those_at_1_ms():
-    env, policy = dexsim.make("grasp", backend="c"), load_policy("grasp")
+    config = GraspConfig(release_delay=(0.0, 0.0))  # objects settle while hands close
+    env, policy = dexsim.make("grasp", config, backend="c"), load_policy("grasp")
     act, step = jax.vmap(policy.act), jax.vmap(env.step)
 
     def close(state, carry):

@@ -84,7 +84,7 @@ class GraspConfig(EnvConfig):
     """Largest speed along the palm, in each direction, at release."""
     release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
     """Largest spin about each of the object's axes at release."""
-    release_delay: tuple[float, float] = setting((0.0, 0.0), unit="s", low=0.0, high=2.0)
+    release_delay: tuple[float, float] = setting((0.1, 0.5), unit="s", low=0.0, high=2.0)
     """Range of the time for which somebody still holds the object after the fingers have begun to move."""
     place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
     """Largest shift of the object along the palm, in each direction."""
