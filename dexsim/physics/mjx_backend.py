@@ -1,8 +1,4 @@
-"""MuJoCo's own `mjx.step`: any device.
-
-No gradients through contacts: MJX's solver is a loop without a reverse mode unless it is one iteration long, and its
-forward mode gave NaN in a grip.
-"""
+"""MuJoCo's own MJX: any device, and gradients through contacts (`dexsim.physics.mjx_solver`)."""
 
 from typing import Any
 
@@ -23,7 +19,9 @@ class MjxBackend:
         """Raises AssetError: MJX lacks what the scene uses."""
         from mujoco import mjx
 
-        self.scene, self.mjx = scene, mjx
+        from dexsim.physics import mjx_solver
+
+        self.scene, self.mjx, self.solver = scene, mjx, mjx_solver
         try:
             self.model = mjx.put_model(scene.model, device=jax.local_devices()[0], impl="jax")
         except NotImplementedError as error:
@@ -42,7 +40,7 @@ class MjxBackend:
         law: ImplicitLaw,
         push: jax.Array,
     ) -> StepResult:
-        """One control tick by `mjx.step`."""
+        """One control tick by MJX."""
         scene, model = self.scene, self.model.replace(**configured(self.scene, object, contacts))
         wrench = jnp.zeros((scene.model.nbody, 6)).at[scene.object_body, :3].set(push)
         data = self.mjx.make_data(self.model).replace(
@@ -53,18 +51,20 @@ class MjxBackend:
             torque, inertia = law(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(torque)
             armature = self.model.dof_armature.at[scene.joint_dof].add(inertia)
-            # MJX relies on implicit promotion, which the caller may have made an error. TF32, the default of products
-            # on NVIDIA GPUs, is too coarse for a solver.
-            with (
-                jax.numpy_rank_promotion("allow"),
-                jax.numpy_dtype_promotion("standard"),
-                jax.default_matmul_precision("highest"),
-            ):
-                return self.mjx.step(model.replace(dof_armature=armature), data.replace(qfrc_applied=applied)), None
+            return self.step(model.replace(dof_armature=armature), data.replace(qfrc_applied=applied)), None
 
         # Forces are read after the scan: as an output of it they would double the step's time.
-        data, _ = jax.lax.scan(substep, data, jnp.arange(scene.config.substeps))
+        with self.solver.mjx_arithmetic():
+            data, _ = jax.lax.scan(substep, data, jnp.arange(scene.config.substeps))
         return StepResult(PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self.finger_force(data))
+
+    def step(self, model: Any, data: Any) -> Any:
+        """`mjx.step`, with a solver that has derivatives. Our scenes have no sensors."""
+        mjx = self.mjx
+        for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+            data = stage(model, data)
+        acceleration, force = self.solver.solve(model, data)
+        return mjx.euler(model, data.tree_replace({"qacc": acceleration, "_impl.efc_force": force}))
 
     def finger_force(self, data: Any) -> jax.Array:
         """Force [F, 3] N of the object on each finger, from data after a step: MJX has no sensor that matches bodies,
