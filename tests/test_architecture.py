@@ -61,11 +61,11 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 16_240,  # goal: 12,500
+    "dexsim": 16_330,  # goal: 12,500
     "dexsim/core": 1_180,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_840,  # goal: 1,900
     "dexsim/hand dexsim/objects": 1_900,  # goal: 1,900
-    "dexsim/physics": 2_600,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/physics": 2_680,  # goal: 2,200, and 1,300 of CUDA
     "dexsim/env dexsim/tasks": 2_890,  # goal, with the roots: 3,200
     ROOTS: 1_350,
     "dexsim/calibration dexsim/identification": 1_940,  # goal: 1,500
@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 4_890,  # goal: 4,000
     "dexsim_real": 10_210,  # goal: 6,500
     "benchmarks": 1_980,
-    "tests": 26_870,  # goal: 18,000
+    "tests": 26_990,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
