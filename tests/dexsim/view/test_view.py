@@ -95,7 +95,7 @@ def set_back(file, seconds):
 
 @pytest.fixture(scope="module")
 def simulation():
-    env = dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
+    env = dexsim.make("grasp", GraspConfig(pool_size=80, release_delay=(0.0, 0.0)), backend="c")
     return Simulation(env, PolicyShelf(env, "grasp"), seed=3)
 
 
