@@ -85,7 +85,7 @@ BUDGETS["long"] = dataclasses.replace(
     BUDGETS["gpu"],
     name="long",
     level=3,
-    training={"grasp": {"steps": 3e8, "evaluate_every": 0}, "rotate": {"steps": 3e8, "evaluate_every": 0}},
+    training={"grasp": {"steps": 1.5e8, "evaluate_every": 0}, "rotate": {"steps": 1.5e8, "evaluate_every": 0}},
 )
 
 
