@@ -183,11 +183,15 @@ class Motions:
             data.qpos[:], data.qvel[:] = begin.state.qpos, begin.state.qvel
             data.qacc_warmstart[:] = begin.state.warmstart
         data.xfrc_applied[scene.object_body, :3] = begin.push
+        limit, armature = self.env.hand.torque_limit, self.template.dof_armature[scene.joint_dof]
         for _ in range(count):
             position, velocity = data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof]
             reach = np.clip(begin.target - position, -REACH, REACH)
-            limit = self.env.hand.torque_limit
-            data.qfrc_applied[scene.joint_dof] = np.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
+            torque = STIFFNESS * reach - DAMPING * velocity
+            data.qfrc_applied[scene.joint_dof] = np.clip(torque, -limit, limit)
+            # As `dexsim.physics.law.implicit`: half of a step's damping is an inertia, of a motor below its limit.
+            slope = np.where(np.abs(torque) < limit, DAMPING, 0.0)
+            model.dof_armature[scene.joint_dof] = armature + 0.5 * model.opt.timestep * slope
             mujoco.mj_step(model, data)
         return data
 

@@ -42,7 +42,8 @@ def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     angles = (round(math.degrees(a) * 100) for a in (yaw, pitch, roll))
-    body = _BODY.pack(index & 0xFF, *angles, *(round(a / 9.80665e-3) for a in acceleration), 0, 0, 0)
+    counts = np.clip(np.round(np.asarray(acceleration) / 9.80665e-3), -32768, 32767).astype(int)  # saturates in a bump
+    body = _BODY.pack(index & 0xFF, *angles, *counts, 0, 0, 0)
     return HEAD + body + bytes([sum(body) & 0xFF])
 
 
