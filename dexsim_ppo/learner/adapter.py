@@ -59,7 +59,7 @@ class AdaptedState:
     key: jax.Array
 
 
-class AdaptedPlan(NamedTuple):
+class Plan(NamedTuple):
     """Evaluation episodes: a key for each, and its number."""
 
     key: jax.Array
@@ -67,7 +67,7 @@ class AdaptedPlan(NamedTuple):
 
 
 class Adapted:
-    """A `SimpleEnvironment` as the learner's `Environment`; see `adapt`."""
+    """A `SimpleEnvironment` as the learner's `Environment`, with the members of an evaluation; see `adapt`."""
 
     backend, evaluation, config = "own", "series", NoSettings()
 
@@ -109,11 +109,11 @@ class Adapted:
         """The episode's clock at a random time."""
         return replace(state, clock=jax.random.randint(key, (), 0, self.evaluation_steps))
 
-    def evaluation_plan(self, count: int, seed: int) -> AdaptedPlan:
+    def evaluation_plan(self, count: int, seed: int) -> Plan:
         """`count` episodes, each from a key of its own."""
-        return AdaptedPlan(jax.random.split(jax.random.key(seed), count), np.arange(count))
+        return Plan(jax.random.split(jax.random.key(seed), count), np.arange(count))
 
-    def evaluation_starts(self, plan: AdaptedPlan) -> AdaptedState:
+    def evaluation_starts(self, plan: Plan) -> AdaptedState:
         """The first states of a plan's episodes."""
         return jax.vmap(self.reset)(plan.key)
 

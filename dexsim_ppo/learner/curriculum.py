@@ -31,8 +31,8 @@ class CurriculumConfig(Config):
         super().__post_init__()
         if self.narrow_below > self.widen_above:
             raise ConfigError(
-                f"CurriculumConfig.narrow_below = {self.narrow_below:g}: must not exceed "
-                f"CurriculumConfig.widen_above = {self.widen_above:g}"
+                f"CurriculumConfig.narrow_below = {self.narrow_below:g}: must not exceed widen_above = "
+                f"{self.widen_above:g}"
             )
 
 

@@ -7,6 +7,7 @@ saving and loading that one pytree resumes training exactly.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -24,15 +25,7 @@ from dexsim_ppo.learner.loss import Metrics, Samples
 from dexsim_ppo.learner.networks import Params, rescale_output
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
 from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, merge_moments, value_std
-from dexsim_ppo.learner.sharding import (
-    block_count,
-    copied,
-    in_blocks,
-    init_on_mesh,
-    moments,
-    sequences_in_blocks,
-    shardings,
-)
+from dexsim_ppo.learner.sharding import block_count, copied, in_blocks, init_on_mesh, moments, shardings
 from dexsim_ppo.learner.state import TrainState, init_state
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.learner.update import Learner, update
@@ -69,12 +62,8 @@ def make_train(
         return strong_types(init_state(env, config, key, curriculum, mesh))
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        state, metrics = jax.lax.scan(
-            lambda s, _: train_iteration(env, config, s, curriculum, mesh),
-            state,
-            None,
-            length=config.iterations_per_call,
-        )
+        iterate = lambda s, _: train_iteration(env, config, s, curriculum, mesh)  # noqa: E731
+        state, metrics = jax.lax.scan(iterate, state, None, length=config.iterations_per_call)
         state = strong_types(state)
         if mesh is not None:
             state = jax.lax.with_sharding_constraint(state, shardings(state, mesh))
@@ -88,7 +77,7 @@ def make_train(
             lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), state, shardings(state, mesh)
         )
 
-    compiled_init = jit(init, once=True) if mesh is None else init_on_mesh(mesh, init, shapes)
+    compiled_init = jit(init, once=True) if mesh is None else functools.partial(init_on_mesh, mesh, init)
     # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
     # twice: copies separate them.
     return Training(
@@ -112,14 +101,8 @@ def train_iteration(
     normalizers = make_normalizers(env, config, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
     batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
-    learner, update_metrics = update(
-        config,
-        normalizers,
-        batch.samples,
-        update_key,
-        Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates),
-        mesh,
-    )
+    learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
+    learner, update_metrics = update(config, normalizers, batch.samples, update_key, learner, mesh)
     metrics |= update_metrics | {
         "bounded_rewards": bounded,
         "explained_variance": batch.explained_variance,
@@ -185,19 +168,13 @@ def prepare(
 ) -> TrainingBatch:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
+    flags = rollout.terminated, rollout.truncated
     advantage, target = compute_gae(
-        rollout.reward,
-        rollout.value,
-        rollout.next_value,
-        rollout.terminated,
-        rollout.truncated,
-        discount=config.discount,
-        gae_lambda=config.gae_lambda,
+        rollout.reward, rollout.value, rollout.next_value, *flags, config.discount, config.gae_lambda
     )
     observations = {group: rollout.obs[group] for group in observation_stats}
-    means, variances = moments(
-        {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}, mesh
-    )
+    values = {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}
+    means, variances = moments(values, mesh)
     size = advantage.size
     observation_stats = {
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
@@ -216,13 +193,11 @@ def prepare(
         carry=rollout.carry,
     )
     blocks = block_count(config, mesh)
-    if rollout.carry is None:
-        samples = in_blocks(samples, blocks)
-    else:
+    if rollout.carry is not None:
         ended = rollout.terminated | rollout.truncated
         # The carry at the rollout's first step is zero already where an episode begins with it.
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
-        samples = sequences_in_blocks(samples, blocks)
+    samples = in_blocks(samples, blocks, sequences=rollout.carry is not None)
     explained = 1 - variances["error"] / variances["target"]
     params = dataclasses.replace(params, critic=critic)
     return TrainingBatch(samples, params, value_stats, observation_stats, explained)

@@ -95,8 +95,7 @@ def collect_rollout(
 
 def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
-    ended (NaN if none did), `episodes` their number, `repeated_starts` how many starts were used before (see
-    `scan_restarting`).
+    ended (NaN if none did), `episodes` their number.
 
     Args:
       finite: [T, B] whether the environment's reward was.
@@ -117,7 +116,6 @@ def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[s
         "episodes": ended,
         "terminated_share": terminated / ended,
         "nonfinite_rewards": nonfinite,
-        "repeated_starts": _repeated(done),
     }
     for name, of, count in (("step", sums, done.size), ("episode", ended_sums, ended)):
         metrics |= {f"{name}/{k}": v / count for k, v in zip(step_metrics, of[len(counted) :], strict=True)}
@@ -134,8 +132,7 @@ def scan_restarting(
 
     Calling `restart` after every step would compute a new episode for every environment and discard
     nearly all of them. Instead one new episode per environment is kept in reserve and renewed after at most
-    16 steps; an environment whose episode ends twice within that time starts the same episode twice
-    (`repeated_starts` counts them: none where episodes last longer).
+    16 steps; an environment whose episode ends twice within that time starts the same episode twice.
     Restarting only the rows that ended would make a GPU wait for the host at every step.
 
     Args:
@@ -147,7 +144,7 @@ def scan_restarting(
       The last states and the outputs [T, ...].
     """
     length = jax.tree.leaves(inputs)[0].shape[0]
-    block = _block(length)
+    block = max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
     restart = jax.jit(restart)
 
     def run_block(state, inputs):
@@ -182,15 +179,3 @@ def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax
     limit = jnp.where(returns.count > 0, _FAR * value_std(returns), at_first)
     bounded = jnp.sum(size > limit, dtype=jnp.float32)
     return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded
-
-
-def _block(length: int) -> int:
-    """Steps that share one reserve of new episodes."""
-    return max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
-
-
-def _repeated(done: jax.Array) -> jax.Array:
-    """Number [] of episodes in `done` [T, B] that began with a start already used."""
-    block = _block(done.shape[0])
-    ends = jnp.sum(done.reshape(-1, block, done.shape[1]), axis=1, dtype=jnp.float32)
-    return jnp.sum(jnp.maximum(ends - 1, 0.0))

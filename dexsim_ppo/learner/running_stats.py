@@ -50,20 +50,14 @@ def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, siz
     mean = stats.mean + weight * delta
     variance = (1 - weight) * stats.variance + weight * variance + weight * (1 - weight) * delta**2
     ok = jnp.isfinite(mean) & jnp.isfinite(variance)
-    return RunningStats(
-        count=count, mean=jnp.where(ok, mean, stats.mean), variance=jnp.where(ok, variance, stats.variance)
-    )
+    return RunningStats(count, jnp.where(ok, mean, stats.mean), jnp.where(ok, variance, stats.variance))
 
 
 def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_floor: float, clip: float) -> Normalizer:
-    """Normaliser of one observation group.
+    """Normaliser of one observation group [n]; `std_floor` is in the observation's units.
 
     Entries with a fixed scale are only divided by it: with running statistics, a channel that is silent
     until first contact would see that contact as an outlier.
-
-    Args:
-      stats: of vectors [n], where n is the sum of the entries' sizes.
-      std_floor: smallest standard deviation of the other entries, in the observation's units.
     """
     scale = np.concatenate([np.full(entry.size, entry.scale or 0.0, np.float32) for entry in layout])
     std = jnp.sqrt(stats.variance + std_floor**2)
@@ -73,10 +67,9 @@ def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_f
 
 def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
     """One observation normaliser per group."""
+    floor, clip = config.observation_std_floor, config.observation_clip
     return {
-        group: make_normalizer(
-            stats[group], layout, std_floor=config.observation_std_floor, clip=config.observation_clip
-        )
+        group: make_normalizer(stats[group], layout, std_floor=floor, clip=clip)
         for group, layout in env.observation_layout.items()
     }
 
@@ -86,11 +79,8 @@ def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
 
     Their count is the largest, so that further samples hardly change them.
     """
-    return RunningStats(
-        count=jnp.int32(MEMORY),
-        mean=jnp.copy(normalizer.mean),
-        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0),
-    )
+    variance = jnp.maximum(normalizer.std**2 - std_floor**2, 0.0)
+    return RunningStats(jnp.int32(MEMORY), jnp.copy(normalizer.mean), variance)
 
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:

@@ -13,8 +13,7 @@ from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import CurriculumConfig
-from dexsim_ppo.learner.memory import carry_size, init_gru, zero_carry
-from dexsim_ppo.learner.networks import Params, init_params
+from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, zero_carry
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats
 from dexsim_ppo.learner.sharding import batched
 from dexsim_ppo.learner.types import Environment
@@ -38,11 +37,7 @@ class TrainState:
 
 
 def init_state(
-    env: Environment,
-    config: PPOConfig,
-    key: jax.Array,
-    curriculum: CurriculumConfig | None = None,
-    mesh: Mesh | None = None,
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig | None, mesh: Mesh | None
 ) -> TrainState:
     """A fresh learner, and freshly reset environments [B, ...] with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
@@ -50,17 +45,12 @@ def init_state(
     memory = None
     if config.memory == "gru":
         memory = init_gru(jax.random.fold_in(params_key, 1), sizes["actor"], config.memory_size)
-    params = init_params(
-        params_key,
-        actor_sizes=(sizes["actor"] + carry_size(memory), *config.actor_layers, env.action_size),
-        critic_sizes=(sizes["critic"] + carry_size(memory), *config.critic_layers, 1),
-        initial_std=config.initial_std,
-        memory=memory,
-    )
+    actor = (sizes["actor"] + carry_size(memory), *config.actor_layers, env.action_size)
+    critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
+    params = init_params(params_key, actor, critic, config.initial_std, memory)
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
-    reset = env.reset
-    if curriculum is not None:
-        reset = functools.partial(cast(Any, env).reset, scale=jnp.float32(curriculum.start))
+    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
         adam=adam.init(params),
@@ -71,6 +61,6 @@ def init_state(
         key=key,
         iteration=jnp.int32(0),
         skipped_updates=jnp.int32(0),
-        scale=None if curriculum is None else jnp.float32(curriculum.start),
+        scale=scale,
         carry=zero_carry(memory, (config.num_envs,)),
     )

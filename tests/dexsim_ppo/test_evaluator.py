@@ -135,3 +135,24 @@ def test_intervals_are_by_start():
     held = np.array([False] * 8 + [True] * 2)
     report = summarize(TinyEnv(), {"return": held[None], "error": held[None]}, held[None], np.arange(10))
     assert (report["held"]["low"], report["held"]["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
+
+
+def test_episodes_end_at_their_first_termination():
+    # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {
+        "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
+        "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
+    }
+    report = summarize(TinyEnv(), metrics, terminated, np.arange(2))
+    assert report["held"]["value"] == 0.5
+    assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
+    assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
+    assert report["task"]["error"] == pytest.approx((1 + 1 + 1 + 4) / 4)
+
+
+def test_a_step_that_diverges_is_counted_although_it_ends_the_episode():
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {"return": np.zeros((3, 2)), "non_finite": np.array([[0.0, 0], [1, 0], [1, 0]])}
+    env = SimpleNamespace(summarize=lambda masked, alive: {"non_finite": masked["non_finite"].sum()})
+    assert summarize(env, metrics, terminated, np.arange(2))["task"]["non_finite"] == 1

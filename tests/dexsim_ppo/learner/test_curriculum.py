@@ -82,12 +82,6 @@ def test_ranges_widen_with_success_and_episodes_update_scale():
     np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
 
 
-def test_ranges_narrow_with_failure():
-    _, rows = run(WideEnv(fails=True), RULES, 7)
-    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.4, 0.3, 0.2, 0.1, 0, 0, 0], atol=1e-5)
-    assert all(row["curriculum/success"] == 0 for row in rows)
-
-
 def test_no_ended_episode_says_nothing():
     _, (row,) = run(WideEnv(lives=100), RULES, 1)
     assert np.isnan(row["curriculum/success"]) and row["curriculum/scale"] == 0.5

@@ -10,13 +10,12 @@ from tiny_env import SMALL, TinyConfig
 
 from dexsim.core.errors import CheckpointError
 from dexsim.core.layout import LayoutEntry
-from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, PolicyParams
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
-from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, progress_line, read_metrics
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -28,14 +27,13 @@ def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
         folder.checkpoint(iteration).touch()
     (folder.checkpoints / "00000999.msgpack.tmp").touch()
     (folder.checkpoints / "mine-00000999.msgpack").touch()
-    found = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
-    assert found() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
+    policy_of(folder.checkpoint(900)).touch()
+    kept = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
+    assert kept() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
     folder.prune(9)
-    assert len(found()) == 4
-    folder.prune(3)
-    assert found() == [100, 900, 1000]
+    assert len(kept()) == 4
     folder.prune(1)
-    assert found() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
+    assert kept() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
 
 
 def policy_after(iteration):
@@ -63,14 +61,6 @@ def test_what_is_set_aside_is_never_replaced(tmp_path):
     kept = {path.name: path.read_text() for path in folder.checkpoints.glob("00000008.*")}
     assert kept == {f"00000008.aside{n}.msgpack": c for n, c in ((1, "first"), (2, "second"), (3, "third"))}
     assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
-
-
-def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path):
-    file = RunFolder(tmp_path).metrics
-    file.write_text(content := '{"iteration": 2}\n{"iterat\n{"iteration": 4}\n')
-    with pytest.raises(CheckpointError, match="metrics.jsonl: line 2 holds no metrics"):
-        MetricsLog(RunFolder(tmp_path), 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
-    assert file.read_text() == content
 
 
 class Writer:
@@ -113,3 +103,13 @@ def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
     assert logged == [({"reward": 0.5}, 500), "finished"]
+
+
+def test_the_progress_line_shows_what_there_is():
+    row = {"iteration": 1180, "env_steps": 4_833_280, "env_steps_per_s": 18412.0, "seconds_left": 208.7}
+    row |= {"episode/return": 184.237, "episode/success": 0.981, "step/force_error": float("nan"), "kl": 0.00812}
+    line = progress_line(row | {"skipped_updates": 2.0, "bounded_rewards": 0.0})
+    assert line == (
+        "iteration 1180 | steps 4.83e+06 | steps/s 1.84e+04 | left 3.5 min | return 184.24 | success 98.1% | KL 0.0081 "
+        "| skipped updates 2"
+    )

@@ -27,20 +27,19 @@ def run(tmp_path, monkeypatch):
         assert (episodes, seed) == (10, trainer.SELECTION_SEED)
         return {"return": {"value": run.returns.pop(0)}, "held": {"value": 1.0}, "task": {}, "seconds": run.takes}, None
 
-    run = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0, evaluator=evaluator)
-    run.returns, run.takes = [], 1.0
+    run = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0)
+    run.evaluator, run.returns, run.takes = evaluator, [], 1.0
     return run
 
 
 def evaluate(run, monkeypatch, *returns):
     """Evaluate one policy after another; the iterations whose policy became the best."""
     saved = []
-    display = types.SimpleNamespace(note=lambda _: None, working=lambda _: None)
     for iteration, value in enumerate(returns):
         policy = types.SimpleNamespace(params=None, save=lambda path, i=iteration: saved.append((i, path)))
         monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
         run.returns.append(value)
-        run._evaluate(None, iteration, display)
+        run._evaluate(None, iteration)
     assert all(path == run.folder.best for _, path in saved)
     return [i for i, _ in saved]
 
@@ -60,19 +59,16 @@ def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run, m
 
 
 def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
-    """A tenth of 100 s: one evaluation must leave room for the one at the end."""
-    rate = 10 * 32 / 4.0  # by which an evaluation is expected to take 4 s: of the two, 8 s
-    assert run._is_evaluation_due(2, rate) and not run._is_evaluation_due(3, rate)
-    assert not run._is_evaluation_due(2, rate / 1.5)  # 12 s
-    run.takes = 60.0  # compilation
+    """A tenth of 100 s: one evaluation must leave room for the one at the end. The first one's time is compilation."""
+    assert run._is_evaluation_due(2) and not run._is_evaluation_due(3)
+    run.takes = 60.0
     evaluate(run, monkeypatch, 1.0)
-    assert not run._is_evaluation_due(4, rate)  # 4 s are spent, and two more would make it 12
-    assert run._is_evaluation_due(4, 2 * rate)  # 2 s each
-    run.takes = 1.0
-    evaluate(run, monkeypatch, 1.0, 1.0)
-    assert run._is_evaluation_due(4, rate) and not run._is_evaluation_due(
-        4, rate / 2
-    )  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
+    assert run._is_evaluation_due(4)
+    run.takes = 3.0
+    evaluate(run, monkeypatch, 1.0)
+    assert run._is_evaluation_due(6), "3 s, and two more"
+    evaluate(run, monkeypatch, 1.0)
+    assert not run._is_evaluation_due(8), "6 s, and two more"
 
 
 def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
