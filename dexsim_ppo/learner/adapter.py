@@ -36,12 +36,10 @@ class SimpleEnvironment(Protocol):
 
     def reset(self, key: jax.Array) -> tuple[jax.Array, Any]:
         """Observation [observation_size] and state of a new episode."""
-        ...
 
     def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
         """Observation, state, reward [] and whether the episode terminated [] (bool) after an action [action_size] in
         [-1, 1]. No restart, and no time limit."""
-        ...
 
 
 @pytree_dataclass
@@ -138,11 +136,8 @@ class Adapted:
 
 
 def adapt(env: Any, name: str = "") -> Environment:
-    """An environment that the learner can train: `env` itself if it is an `Environment`, else a wrapper around it.
-
-    Args:
-      env: an `Environment`, or an object with the members of `SimpleEnvironment`.
-      name: of the task, for reports and policies; that of the environment's class by default.
+    """`env` itself if it is an `Environment`, else a wrapper of a `SimpleEnvironment`; its name is that of its class
+    by default.
 
     Raises:
       ConfigError: a member is missing.

@@ -95,12 +95,8 @@ def collect_rollout(
 
 def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
-    ended (NaN if none did), `episodes` their number.
-
-    Args:
-      finite: [T, B] whether the environment's reward was.
-      step_metrics: the environment's own [T, B].
-    """
+    ended (NaN if none did), `episodes` their number. `finite` [T, B] says whether the environment's reward was, and
+    `step_metrics` [T, B] are its own."""
     done = rollout.terminated | rollout.truncated
     counted = (rollout.reward, done, rollout.terminated, ~finite)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs. One product gives
@@ -164,14 +160,8 @@ def scan_restarting(
 
 
 def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax.Array]:
-    """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations.
-
-    Args:
-      returns: statistics of the returns so far [].
-
-    Returns:
-      The experience, and the number [] of rewards that were bounded.
-    """
+    """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations; also
+    the number [] of these. `returns` [] are statistics of the returns so far."""
     size = jnp.abs(rollout.reward).reshape(-1)
     others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
     spread = jnp.sqrt(jnp.mean(others**2))

@@ -12,8 +12,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
-Preset = TrainArguments[Any]
-"""A preset is the command's options without those of a task."""
+Preset = TrainArguments[Any]  # without the options of a task
 
 # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data. Our tasks take
 # large steps, which become smaller; see `find_preset`.
@@ -110,7 +109,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
 
 
 def device_preset() -> str:
-    """The name of the preset for the device found, and on a CPU for the number of cores that this process may use."""
+    """The preset for the device found, on a CPU by the number of cores that this process may use."""
     if jax.default_backend() == "gpu":
         return "gpu"
     return "cpu-large" if available_cores() >= 16 else "cpu"

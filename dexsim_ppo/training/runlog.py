@@ -118,31 +118,17 @@ def _free(folder: Path, pattern: str) -> Path:
     return next(path for path in paths if not path.exists())
 
 
-def new_folder(path: Path | None, task: str) -> Path:
-    """A new folder for a run, by default one that is named after its task and the time. Runs that begin in the same
-    second get different ones.
-
-    Raises:
-      ConfigError: `path` exists already.
-    """
-    if path:
-        check_new(path)
-        path.mkdir(parents=True)
-        return path
-    stem = f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    Path("runs").mkdir(exist_ok=True)
-    for number in itertools.count():
-        path = Path("runs") / (f"{stem}-{number}" if number else stem)
-        with contextlib.suppress(FileExistsError):
-            path.mkdir()
-            return path
-    raise AssertionError("unreachable")
-
-
 def check_new(path: Path | None) -> None:
     """Raises ConfigError: the folder given for a new run exists already."""
     if path and path.exists():
         raise ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
+
+
+def new_folder(path: Path | None, task: str) -> Path:
+    """A new folder for a run, by default one that is named after its task and the time."""
+    path = path or Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    path.mkdir(parents=True)
+    return path
 
 
 def folder_of(checkpoint: Path) -> Path:

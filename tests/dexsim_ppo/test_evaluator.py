@@ -5,7 +5,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv
@@ -54,12 +53,16 @@ def test_totals_are_those_of_the_series(policy):
 
 def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
     """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
-    number = lambda steps: evaluate.default_episodes(SimpleNamespace(evaluation_steps=steps))  # noqa: E731
-    assert [number(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [1024, 1024, 512, 384, 128, 64, 64]
-    chunk = lambda **options: evaluate.chunk_of(evaluate.EvaluateArguments(policy="grasp", **options))  # noqa: E731
-    assert (chunk(), chunk(episodes=3), chunk(episodes=3, chunk=2)) == (64, 3, 2)
+
+    def sizes(steps, **options):
+        arguments = evaluate.EvaluateArguments(policy="grasp", **options)
+        return evaluate.sizes(SimpleNamespace(evaluation_steps=steps), arguments)
+
+    numbers = [1024, 1024, 512, 384, 128, 64, 64]
+    assert [sizes(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [(number, 64) for number in numbers]
+    assert (sizes(290, episodes=3), sizes(290, episodes=3, chunk=2)) == ((3, 3), (3, 2))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert number(4000) == chunk() == 1024
+    assert sizes(4000) == (1024, 1024)
 
 
 @pytree_dataclass
@@ -106,18 +109,6 @@ def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_
         with pytest.raises(ConfigError, match=f"^{words}"):
             evaluate.main([name, *options])
     assert (tmp_path / "policy.msgpack").read_bytes() == before
-
-
-def test_the_tick_that_ends_an_episode_counts_and_none_after_it():
-    """Three episodes: one ends in tick 2, one in the first tick, one never. Its last metrics are those of that tick."""
-    ends = np.array([[False, True, False], [True, False, False], [True, True, False], [False, False, False]])
-    last = {"return": jnp.zeros(3)}, jnp.zeros(3, jnp.int32), jnp.zeros(3, bool)
-    for tick, ended in enumerate(ends):
-        last = evaluate._follow(last, {"return": jnp.full(3, 10.0 * (tick + 1))}, jnp.asarray(ended))
-    metrics, lived, ended = last
-    np.testing.assert_array_equal(metrics["return"], [20.0, 10.0, 40.0])
-    np.testing.assert_array_equal(lived, [1, 0, 4])
-    np.testing.assert_array_equal(ended, [True, True, False])
 
 
 def test_intervals_are_by_start():

@@ -2,7 +2,7 @@
 
 import json
 import sys
-import types
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
@@ -63,46 +63,24 @@ def test_what_is_set_aside_is_never_replaced(tmp_path):
     assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
 
 
-class Writer:
-    """A TensorBoard writer that remembers."""
-
-    def __init__(self):
-        self.scalars, self.closed = [], False
-
-    def add_scalar(self, *scalar):
-        self.scalars.append(scalar)
-
-    def close(self):
-        self.closed = True
-
-
-def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
+def test_a_resumed_log_goes_on_after_the_checkpoint_and_to_every_sink(tmp_path, monkeypatch):
     """What came after it is repeated; a line that was cut ends the rows."""
-    writer = Writer()
+    said = []
+    writer = SimpleNamespace(add_scalar=lambda *scalar: said.append(scalar), close=lambda: said.append("closed"))
+    run = SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
     monkeypatch.setattr(runlog, "_tensorboard_writer", lambda path: writer)
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: (said.append(given), run)[1]))
     folder = RunFolder(tmp_path)
     folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4, 6, 8)) + '{"iterat')
-    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL))
+    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3))
     log.write({"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": float("nan")})
-    assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4, 6, 8], "written at once"
-    assert read_metrics(folder.metrics)[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
-    assert writer.scalars == [("kl", 0.5, 800)], "over environment steps, and no NaN"
-    log.close()
-    assert writer.closed
-
-
-def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
-    said = []
-    run = types.SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
-    fake = types.SimpleNamespace(init=lambda **given: (said.append(given), run)[1])
-    monkeypatch.setitem(sys.modules, "wandb", fake)
-    arguments = TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3)
-    log = runlog.MetricsLog(runlog.RunFolder(tmp_path), 0, arguments)
-    log.write({"iteration": 1, "env_steps": 500, "reward": 0.5, "kl": float("nan")})
+    rows = read_metrics(folder.metrics)  # written at once
+    assert [row["iteration"] for row in rows] == [2, 4, 6, 8]
+    assert rows[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
     log.close()
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
-    assert logged == [({"reward": 0.5}, 500), "finished"]
+    assert logged == [("kl", 0.5, 800), ({"kl": 0.5}, 800), "closed", "finished"], "over environment steps, and no NaN"
 
 
 def test_the_progress_line_shows_what_there_is():
