@@ -13,8 +13,7 @@ from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
     from dexsim_ppo.evaluate import evaluate_policy
-    from dexsim_ppo.learner.config import PPOConfig
-    from dexsim_ppo.learner.curriculum import CurriculumConfig
+    from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
     from dexsim_ppo.learner.ppo import TrainState, make_train
     from dexsim_ppo.policy import Policy, act, load_policy
     from dexsim_ppo.train import TrainResult, train_policy
@@ -36,7 +35,7 @@ __getattr__, __dir__ = open_door(
     __name__,
     __all__,
     {
-        "CurriculumConfig": "dexsim_ppo.learner.curriculum",
+        "CurriculumConfig": "dexsim_ppo.learner.config",
         "PPOConfig": "dexsim_ppo.learner.config",
         "Policy": "dexsim_ppo.policy",
         "TrainState": "dexsim_ppo.learner.ppo",

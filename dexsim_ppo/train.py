@@ -35,8 +35,7 @@ from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training import processes

@@ -10,7 +10,8 @@ from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.networks import Params, apply_mlp, scan_memory, step_memory
-from dexsim_ppo.learner.running_stats import Normalizer, normalize
+from dexsim_ppo.learner.running_stats import Normalizer, RunningStats, make_normalizer, normalize
+from dexsim_ppo.learner.types import Environment
 
 Metrics = dict[str, jax.Array]
 Observation = Mapping[str, jax.Array]  # by group, "actor" and "critic"
@@ -31,6 +32,15 @@ class Samples:
     target: jax.Array  # normalised
     carry: jax.Array | None = None  # of the actor's memory before the step
     first: jax.Array | None = None  # whether the step is the first of an episode, with a GRU
+
+
+def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> Normalizers:
+    """One observation normaliser per group."""
+    floor, clip = config.observation_std_floor, config.observation_clip
+    return {
+        group: make_normalizer(stats[group], layout, std_floor=floor, clip=clip)
+        for group, layout in env.observation_layout.items()
+    }
 
 
 def actor_mean(config: PPOConfig, params: Params, normalizers: Normalizers, samples: Samples) -> jax.Array:

@@ -17,17 +17,17 @@ from jax.sharding import Mesh
 
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import layout_size
+from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.loss import Metrics, Samples
-from dexsim_ppo.learner.networks import Params, rescale_output
+from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
+from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
-from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, merge_moments, value_std
-from dexsim_ppo.learner.sharding import block_count, copied, in_blocks, init_on_mesh, moments, shardings
-from dexsim_ppo.learner.state import TrainState, init_state
-from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments, value_std
+from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
+from dexsim_ppo.learner.types import Environment, TrainState
 from dexsim_ppo.learner.update import Learner, update
 
 
@@ -87,6 +87,36 @@ def make_train(
     )
 
 
+def init_state(
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig | None, mesh: Mesh | None
+) -> TrainState:
+    """A fresh learner, and freshly reset environments [B, ...] with staggered clocks."""
+    params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
+    sizes = {group: layout_size(layout) for group, layout in env.observation_layout.items()}
+    memory = None
+    if config.memory == "gru":
+        memory = init_gru(jax.random.fold_in(params_key, 1), sizes["actor"], config.memory_size)
+    actor = (sizes["actor"] + carry_size(memory), *config.actor_layers, env.action_size)
+    critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
+    params = init_params(params_key, actor, critic, config.initial_std, memory)
+    resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
+    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
+    return TrainState(
+        params=params,
+        adam=adam.init(params),
+        learning_rate=jnp.float32(config.learning_rate),
+        observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
+        value_stats=init_stats(()),
+        env_state=batched(env.randomize_episode_time, mesh)(batched(reset, mesh)(resets), staggers),
+        key=key,
+        iteration=jnp.int32(0),
+        skipped_updates=jnp.int32(0),
+        scale=scale,
+        carry=zero_carry(memory, (config.num_envs,)),
+    )
+
+
 def train_iteration(
     env: Environment,
     config: PPOConfig,
@@ -131,7 +161,8 @@ def train_iteration(
 
 
 def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
-    """The next scale [] of the curriculum, and the success [] of this iteration.
+    """The next scale [] of the curriculum, in [0, 1], and the success [] of this iteration. A NaN success (no episode
+    has ended) leaves the scale unchanged.
 
     Raises:
       ConfigError: the curriculum names a metric that does not exist.
@@ -142,7 +173,9 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
         success = metrics[curriculum.metric]
     else:
         raise ConfigError(f"CurriculumConfig.metric = {curriculum.metric!r}: choose from {', '.join(sorted(metrics))}")
-    return next_scale(scale, success, curriculum), success
+    narrower = jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0)
+    step = jnp.where(success >= curriculum.widen_above, curriculum.step, narrower)
+    return jnp.clip(scale + step, 0.0, 1.0), success
 
 
 # --- advantages ---------------------------------------------------------------------------------------

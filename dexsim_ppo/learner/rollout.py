@@ -12,11 +12,10 @@ from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import Decision
-from dexsim_ppo.learner.loss import actor_step, critic_value
-from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, value_std
+from dexsim_ppo.learner.loss import actor_step, critic_value, make_normalizers
+from dexsim_ppo.learner.running_stats import RunningStats, value_std
 from dexsim_ppo.learner.sharding import batched
-from dexsim_ppo.learner.state import TrainState
-from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.learner.types import Environment, TrainState
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
 # bounded, not dropped: where rewards do grow, each iteration raises the bound.

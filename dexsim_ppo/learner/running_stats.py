@@ -8,8 +8,6 @@ import numpy as np
 
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import align, pytree_dataclass, static
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.types import Environment
 
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
 # cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
@@ -63,15 +61,6 @@ def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_f
     std = jnp.sqrt(stats.variance + std_floor**2)
     fixed = scale > 0
     return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
-
-
-def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
-    """One observation normaliser per group."""
-    floor, clip = config.observation_std_floor, config.observation_clip
-    return {
-        group: make_normalizer(stats[group], layout, std_floor=floor, clip=clip)
-        for group, layout in env.observation_layout.items()
-    }
 
 
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:

@@ -11,9 +11,8 @@ from jax.sharding import Mesh
 from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.loss import Metrics, Samples, loss
+from dexsim_ppo.learner.loss import Metrics, Normalizers, Samples, loss
 from dexsim_ppo.learner.networks import Params
-from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.learner.sharding import averaged
 
 
@@ -28,7 +27,7 @@ class Learner(NamedTuple):
 
 def update(
     config: PPOConfig,
-    normalizers: dict[str, Normalizer],
+    normalizers: Normalizers,
     samples: Samples,
     key: jax.Array,
     learner: Learner,

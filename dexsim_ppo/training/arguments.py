@@ -11,8 +11,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.policy import Policy
 
 EnvConfig = TypeVar("EnvConfig")

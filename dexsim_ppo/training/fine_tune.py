@@ -10,7 +10,7 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.networks import carry_size
 from dexsim_ppo.learner.running_stats import recover_stats
-from dexsim_ppo.learner.state import TrainState
+from dexsim_ppo.learner.types import TrainState
 from dexsim_ppo.policy import Policy
 
 

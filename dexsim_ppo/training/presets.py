@@ -8,8 +8,7 @@ import jax
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
 Preset = TrainArguments[Any]  # without the options of a task

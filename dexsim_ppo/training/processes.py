@@ -17,7 +17,7 @@ from jax.sharding import Mesh, NamedSharding
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.sharding import copied
-from dexsim_ppo.learner.state import TrainState
+from dexsim_ppo.learner.types import TrainState
 
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
 _JOBS = ("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX")

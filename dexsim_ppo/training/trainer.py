@@ -128,11 +128,8 @@ class Run:
         return state
 
     def _loop(self, state: TrainState, step: Callable, log: MetricsLog | None, stopped: Callable[[], int]) -> None:
-        arguments, per_call, per_iteration = (
-            self.arguments,
-            self.config.iterations_per_call,
-            self.config.steps_per_iteration,
-        )
+        arguments, per_call = self.arguments, self.config.iterations_per_call
+        per_iteration = self.config.steps_per_iteration
         iteration = first = int(state.iteration)
         begin, calls_s = time.perf_counter(), list[float]()
         faults, evaluated = Faults(self.config, self.folder, state), iteration == 0

@@ -10,7 +10,7 @@ from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
 
 RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
