@@ -2,10 +2,9 @@
 
     python -m dexsim_ppo.evaluate grasp --episodes 1024 --seed 0
 
-The policy is a file, or the name of a shipped one. The episodes are the task's own protocol
-(`env.evaluation_plan`), never restarted: what counts is whether the hand still holds at the end. Their start states
-are drawn for this evaluation by its seed; training had others. Beside the policy a hand that does nothing gets the
-same episodes: what it achieves, too, is no achievement.
+The episodes are the task's own protocol, never restarted: what counts is whether the hand still holds at the end. Their
+start states are drawn by the seed; training had others. A hand that does nothing gets the same episodes: what it
+achieves, too, is no achievement.
 """
 
 import contextlib
@@ -36,14 +35,7 @@ from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 
 class Evaluator:
-    """Runs evaluation episodes in compiled chunks, so that memory is bounded by the chunk.
-
-    Args:
-      env: the environment.
-      chunk: episodes run side by side.
-    """
-
-    FILMED_S = 60.0
+    """Runs evaluation episodes in compiled chunks of so many side by side, by which memory is bounded."""
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
@@ -117,8 +109,8 @@ class Evaluator:
         return jnp.where(ends[0] == ends[1], jnp.array([0, self.chunk - 1]), ends)
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
-        """The shown episodes one after another, each to half a second after it terminated."""
-        after, longest = (round(s / self.env.control_period) for s in (0.5, self.FILMED_S))
+        """The shown episodes one after another, each to half a second after it terminated, and a minute at most."""
+        after, longest = (round(seconds / self.env.control_period) for seconds in (0.5, 60.0))
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
         ends = [min(end, longest) for end in ends]
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
@@ -196,7 +188,7 @@ class EvaluateArguments(Config):
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
-    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise mjx."""
     chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)

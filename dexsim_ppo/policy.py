@@ -112,20 +112,13 @@ class Policy:
 
     def act(self, carry: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
         """The next carry `[..., m]` and the action `[..., A]` for an actor observation `[..., n]`: the compiled
-        `dexsim_ppo.act(self.params, carry, obs)`.
-
-        Raises:
-          ConfigError: the observation has another size, or the carry is not that of this policy and batch.
-        """
+        `dexsim_ppo.act(self.params, carry, obs)`."""
         return _act(self.params, carry, obs)
 
     def ablate(self, *names: str) -> "Policy":
         """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.
 
         Shows what the policy relies on. A policy that was trained without those fields may do better.
-
-        Raises:
-          ConfigError: it observes no such field.
         """
         known = sorted(entry.name for entry in self.observation_layout)
         if unknown := sorted(set(names) - set(known)):
@@ -167,21 +160,13 @@ class Policy:
         checkpoint.save(path, kind="policy", task=self.task, content=self.header(), tree=self.arrays())
 
     def find_hand(self, given: str | Path | None = None) -> "Hand | None":
-        """The hand that the policy was trained on, or the file that is `given`; None for the default one.
-
-        Raises:
-          ConfigError: that hand is not here, its files have changed, or the given one has other joints, fingers or
-            taxels.
-        """
+        """The hand that the policy was trained on, or the file that is `given`; None for the default one. Raises
+        ConfigError if its files have changed, or if the given one has other joints, fingers or taxels."""
         return recorded_hand(self.hand, given, f"the policy of {self.task!r}")
 
     def make_env(self, *, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
-        """The environment that the policy was trained in; arguments as in `dexsim.make`.
-
-        Raises:
-          ConfigError: its task is not registered.
-          CheckpointError: today's task gives another observation.
-        """
+        """The environment that the policy was trained in; arguments as in `dexsim.make`. Raises
+        CheckpointError if today's task gives another observation."""
         from dexsim.registry import find_task, make
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
@@ -191,11 +176,7 @@ class Policy:
         return cast(Any, env)
 
     def check_fit(self, env: Environment) -> None:
-        """Whether the policy can act in an environment.
-
-        Raises:
-          CheckpointError: it observes something else, or takes other actions.
-        """
+        """Raises CheckpointError: the environment gives another observation, or takes other actions."""
         layouts = tuple(env.observation_layout["actor"]), self.observation_layout
         if layouts[0] != layouts[1]:
             given, expected = (", ".join(f"{entry.name} [{entry.size}]" for entry in layout) for layout in layouts)
@@ -204,12 +185,8 @@ class Policy:
             raise CheckpointError(f"{env.name} takes {env.action_size} actions; the policy gives {actions}")
 
     def check_env(self, env: Environment) -> None:
-        """Whether an environment is the one that the policy was trained in; warns (`OtherEnvWarning`) of settings that
-        differ.
-
-        Raises:
-          CheckpointError: the policy cannot act in it; see `check_fit`.
-        """
+        """Warn (`OtherEnvWarning`) of settings that differ from those that the policy was trained with. Raises
+        CheckpointError if it cannot act in this environment."""
         self.check_fit(env)
         today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
         trained, now = flat(to_dict(today)), flat(to_dict(env.config))
@@ -226,13 +203,8 @@ class Policy:
     def from_training(
         cls, env: Environment, config: Any, state: Any, training: dict[str, Any] | None = None
     ) -> "Policy":
-        """The policy that a learner's state stands for.
-
-        Args:
-          config: the `PPOConfig` that it is trained with.
-          state: a `TrainState`; its arrays are copied, so the state may be donated afterwards.
-          training: what to remember of its origin.
-        """
+        """The policy of a learner with this `PPOConfig` and `TrainState`, whose arrays are copied; `training` is what
+        to remember of its origin."""
         layout = tuple(env.observation_layout["actor"])
         floor, clip = config.observation_std_floor, config.observation_clip
         normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)

@@ -240,11 +240,7 @@ def default_arguments(task: str | None, preset: str, source: Source) -> TrainArg
 
 
 def saved_arguments(path: Path, task: str | None) -> TrainArguments:
-    """The options in `config.json` of a run, or of the run in this folder.
-
-    Raises:
-      ConfigError: it is no such file, or of another task than the one given.
-    """
+    """The options in `config.json` of a run, or of the run in this folder. Raises ConfigError if of another task."""
     file = RunFolder(path).config if path.is_dir() else path
     try:
         saved = json.loads(file.read_text())["arguments"]

@@ -45,10 +45,9 @@ def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
     """Orthogonal kernels, of gain sqrt(2) in hidden layers, and zero biases for `sizes[0] -> sizes[1] -> ...`."""
     layers = []
     keys = jax.random.split(key, len(sizes) - 1)
-    for i, (rows, columns) in enumerate(itertools.pairwise(sizes)):
+    for i, shape in enumerate(itertools.pairwise(sizes)):
         gain = output_gain if i == len(sizes) - 2 else 2.0**0.5
-        kernel = jax.nn.initializers.orthogonal(gain)(keys[i], (rows, columns), jnp.float32)
-        layers.append(Layer(kernel=kernel, bias=jnp.zeros(columns)))
+        layers.append(Layer(jax.nn.initializers.orthogonal(gain)(keys[i], shape, jnp.float32), jnp.zeros(shape[1])))
     return tuple(layers)
 
 
@@ -90,10 +89,9 @@ def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.A
 
     Preserves the critic's predictions when the value normaliser changes (PopArt, van Hasselt et al. 2016).
     """
-    last = layers[-1]
-    kernel = last.kernel * (std / new_std)
+    *others, last = layers
     bias = (last.bias * std + mean - new_mean) / new_std
-    return (*layers[:-1], Layer(kernel=kernel, bias=bias))
+    return (*others, Layer(last.kernel * (std / new_std), bias))
 
 
 # --- memory -------------------------------------------------------------------------------------------

@@ -49,9 +49,6 @@ def make_train(
     Args:
       env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
       mesh: devices to spread the environments over (`learner.sharding`); None for one.
-
-    Raises:
-      ConfigError: JAX is set to float64, or the environment lacks something.
     """
     check_float32()
     env = adapt(env)

@@ -56,11 +56,7 @@ class RunFolder:
         return sorted(self.checkpoints.glob("[0-9]" * 8 + ".msgpack"))
 
     def latest_checkpoint(self) -> Path:
-        """The newest checkpoint.
-
-        Raises:
-          CheckpointError: there is none.
-        """
+        """The newest checkpoint; raises CheckpointError if there is none."""
         if not (paths := self.existing_checkpoints()):
             raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
         return paths[-1]
@@ -72,11 +68,8 @@ class RunFolder:
             policy_of(path).unlink(missing_ok=True)
 
     def lock(self) -> contextlib.ExitStack:
-        """Keep other processes from training this run, until the result is closed or this process ends.
-
-        Raises:
-          ConfigError: another process trains it already.
-        """
+        """Keep other processes from training this run, until the result is closed or this process ends. Raises
+        ConfigError if another process trains it already."""
         stack = contextlib.ExitStack()
         with contextlib.suppress(OSError):  # Some file systems have no locks, and some lock only what one may write.
             file = stack.enter_context(self.config.open("rb+"))
@@ -132,11 +125,7 @@ def new_folder(path: Path | None, task: str) -> Path:
 
 
 def folder_of(checkpoint: Path) -> Path:
-    """The folder of the run that a checkpoint is of.
-
-    Raises:
-      ConfigError: it is in none, or the run lacks a file that it needs at the end.
-    """
+    """The folder of the run that a checkpoint is of. Raises ConfigError if it lacks what a run needs at the end."""
     folder = RunFolder(checkpoint.resolve().parent.parent)
     for file in (folder.config, folder.untrained):
         if not file.exists():
