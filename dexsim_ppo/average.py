@@ -38,7 +38,7 @@ def average_policies(policies: Sequence[Policy]) -> Policy:
         raise ConfigError("an average needs two policies or more")
     first, *others = policies
     for number, other in enumerate(others, start=2):
-        for name in ("task", "spec", "hand", "observation_layout", "control_rate"):
+        for name in ("task", "observation_layout", "control_rate", "hand", "spec"):
             if getattr(other, name) != getattr(first, name):
                 raise ConfigError(f"policy {number} differs from the first in its {name}")
         if jax.tree.map(np.shape, other.params) != jax.tree.map(np.shape, first.params):

@@ -48,11 +48,7 @@ def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], 
 
 
 def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
-    """Read and check a file.
-
-    Args:
-      kind: what the caller can use, `"train"` or `"policy"`.
-      task: the task that the caller works on; None takes any.
+    """Read and check a file of this kind, `"train"` or `"policy"`, and task; None takes any task.
 
     Raises:
       CheckpointError: missing, not of this format or version, cut short, altered, of another kind or of another task.
@@ -74,11 +70,8 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
 
 
 def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
-    """The leaves in the shape of `like`, arrays or `jax.ShapeDtypeStruct`s.
-
-    Raises:
-      CheckpointError: a leaf is missing, left over, or of another shape or type; names it.
-    """
+    """The leaves in the shape of `like`, arrays or `jax.ShapeDtypeStruct`s. Raises CheckpointError with the name of a
+    leaf that is missing, left over, or of another shape or type."""
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
     where = f"{checkpoint.path}: does not fit this configuration"

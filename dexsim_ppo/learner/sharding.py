@@ -30,10 +30,7 @@ Tree = TypeVar("Tree")
 
 
 def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
-    """The devices to train on; None for one device of one process, which needs no mesh.
-
-    Args:
-      devices: how many, of all processes together; 0 for all that there are.
+    """So many devices of all processes together, 0 for all; None for one device of one process, which needs no mesh.
 
     Raises:
       ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by them.

@@ -95,11 +95,7 @@ def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainA
 
 
 def find_hand(arguments: TrainArguments, source: Checkpoint | Policy | None) -> Hand | None:
-    """The hand to train; None for the default one.
-
-    Raises:
-      ConfigError: the run or policy to begin from is of another hand.
-    """
+    """The hand to train; None for the default one. Raises ConfigError if what the run begins from has another."""
     if source is None:
         return load_hand(arguments.hand) if arguments.hand else None
     if isinstance(source, Policy):

@@ -94,11 +94,7 @@ def find_preset(name: str, task: str) -> Preset:
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
-    """The options' defaults under a preset.
-
-    Raises:
-      ConfigError: there is no such preset.
-    """
+    """The options' defaults under a preset."""
     if name != "auto" and name not in PRESETS:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     preset = find_preset(device_preset() if name == "auto" else name, task)

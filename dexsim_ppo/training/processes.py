@@ -27,11 +27,7 @@ _REPORT = 3600  # s that the others wait for the first, which evaluates and rend
 
 def connect() -> None:
     """Join the other processes of a Slurm, Open MPI or Kubernetes job, where this is one. Call it before any device
-    is used.
-
-    Raises:
-      DexsimError: the others cannot be reached.
-    """
+    is used."""
     if jax.distributed.is_initialized() or not any(name in os.environ for name in _JOBS):
         return
     try:

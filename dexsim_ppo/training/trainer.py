@@ -42,15 +42,8 @@ def due(iteration: int, per_call: int, every: int) -> bool:
 
 
 class Run:
-    """One training run. `train` and then `finish` leave everything in its folder.
-
-    Args:
-      env: the environment to train in.
-      arguments: the command's options.
-      folder: where files go.
-      started: `time.perf_counter()` at the start of the command.
-      mesh: devices to train on; None for one.
-    """
+    """One training run. `train` and then `finish` leave everything in its folder. `started` is `time.perf_counter()` at
+    the start of the command."""
 
     def __init__(
         self, env: Environment, arguments: TrainArguments, folder: RunFolder, started: float, mesh: Mesh | None = None
