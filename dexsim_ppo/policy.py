@@ -74,20 +74,7 @@ _act = jax.jit(act)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PolicyHeader(Config):
-    """What the file of a policy says beside its numbers; see `Policy`."""
-
-    env_config: dict[str, Any]
-    control_rate: float = setting(dataclasses.MISSING, unit="Hz", low=1.0, high=1000.0)
-    observation_layout: tuple[tuple[str, int, float | None], ...]
-    clip: float = setting(dataclasses.MISSING, unit="1", low=0.1, high=1e4)
-    training: dict[str, Any]
-    spec: TaskSpec | None
-    hand: dict[str, Any] | None
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Policy:
+class Policy(Config):
     """A deterministic policy and what one must know to use it."""
 
     task: str
@@ -96,7 +83,7 @@ class Policy:
     observation_layout: tuple[LayoutEntry, ...]
     """Layout of the actor's observation."""
     params: PolicyParams
-    control_rate: float
+    control_rate: float = setting(unit="Hz", low=1.0, high=1000.0)
     """Actions per second, Hz."""
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Where it comes from: seed, steps, learner settings."""
@@ -133,16 +120,9 @@ class Policy:
         return dataclasses.replace(self, params=params)
 
     def header(self) -> dict[str, Any]:
-        """What its file says beside the numbers: a `PolicyHeader` as plain data."""
-        return {
-            "env_config": self.env_config,
-            "control_rate": self.control_rate,
-            "observation_layout": [list(entry) for entry in self.observation_layout],
-            "clip": self.params.normalizer.clip,
-            "training": self.training,
-            "spec": self.spec and to_dict(self.spec),
-            "hand": self.hand,
-        }
+        """What its file says beside the numbers, as plain data."""
+        names = ("env_config", "observation_layout", "control_rate", "training", "spec", "hand")
+        return {name: to_dict(getattr(self, name)) for name in names} | {"clip": self.params.normalizer.clip}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The numbers of its file by name; see `dexsim_ppo.portable`."""
@@ -265,26 +245,18 @@ def _find(name: str | Path) -> Path:
 
 
 def _from_file(file: checkpoint.Checkpoint) -> Policy:
-    header = from_dict(PolicyHeader, file.content)
     # The path of a dictionary's leaf is ['mean'].
     arrays = {path.strip("[']"): jnp.asarray(array) for path, array in file.leaves.items()}
-    layers = [
-        Layer(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(sum("kernel_" in name for name in arrays))
-    ]
+    layer = lambda kernel, bias: Layer(arrays[kernel], arrays[bias])  # noqa: E731
+    count = sum(name.startswith("kernel_") for name in arrays)
     memory = None
     if "recurrent_kernel" in arrays:
-        gates = (Layer(arrays[f"{part}_kernel"], arrays[f"{part}_bias"]) for part in ("input", "recurrent"))
-        memory = GRU(*gates)
-    return Policy(
-        task=file.task,
-        env_config=header.env_config,
-        observation_layout=tuple(LayoutEntry(*entry) for entry in header.observation_layout),
-        params=PolicyParams(tuple(layers), Normalizer(arrays["mean"], arrays["std"], header.clip), memory),
-        control_rate=header.control_rate,
-        training=header.training,
-        spec=header.spec,
-        hand=header.hand,
-    )
+        memory = GRU(layer("input_kernel", "input_bias"), layer("recurrent_kernel", "recurrent_bias"))
+    header = dict(file.content)
+    normalizer = Normalizer(arrays["mean"], arrays["std"], header.pop("clip"))
+    params = PolicyParams(tuple(layer(f"kernel_{i}", f"bias_{i}") for i in range(count)), normalizer, memory)
+    layout = tuple(LayoutEntry(*entry) for entry in header.pop("observation_layout"))
+    return Policy(task=file.task, observation_layout=layout, params=params, **header)
 
 
 def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
