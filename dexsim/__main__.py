@@ -17,7 +17,7 @@ COMMANDS = {
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
     "view": ("dexsim.view.__main__", "show a hand live in the browser"),
     "average": ("dexsim_ppo.average", "average policies that were fine-tuned from one"),
-    "export": ("dexsim_ppo.export", "write a policy for programs without JAX"),
+    "export": ("dexsim_ppo.export", "write a policy as an ONNX model"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
     "run": ("dexsim_real.run.__main__", "run a policy on the hand"),
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
@@ -25,7 +25,6 @@ COMMANDS = {
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
     "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
-    "reproduce": ("dexsim_ppo.reproduce", "replay a faulty training iteration"),
 }
 """Module and purpose of each command."""
 

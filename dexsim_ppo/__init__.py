@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING
 from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
-    from dexsim_ppo.acting import act
     from dexsim_ppo.evaluate import evaluate_policy
-    from dexsim_ppo.learner.config import PPOConfig
-    from dexsim_ppo.learner.curriculum import CurriculumConfig
+    from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
     from dexsim_ppo.learner.ppo import TrainState, make_train
-    from dexsim_ppo.policy import Policy, load_policy
+    from dexsim_ppo.policy import Policy, act, load_policy
     from dexsim_ppo.train import TrainResult, train_policy
 
 __all__ = [
@@ -37,12 +35,12 @@ __getattr__, __dir__ = open_door(
     __name__,
     __all__,
     {
-        "CurriculumConfig": "dexsim_ppo.learner.curriculum",
+        "CurriculumConfig": "dexsim_ppo.learner.config",
         "PPOConfig": "dexsim_ppo.learner.config",
         "Policy": "dexsim_ppo.policy",
         "TrainState": "dexsim_ppo.learner.ppo",
         "TrainResult": "dexsim_ppo.train",
-        "act": "dexsim_ppo.acting",
+        "act": "dexsim_ppo.policy",
         "evaluate_policy": "dexsim_ppo.evaluate",
         "load_policy": "dexsim_ppo.policy",
         "make_train": "dexsim_ppo.learner.ppo",

@@ -2,10 +2,9 @@
 
     python -m dexsim_ppo.evaluate grasp --episodes 1024 --seed 0
 
-The policy is a file, or the name of a shipped one. The episodes are the task's own protocol
-(`env.evaluation_plan`), never restarted: what counts is whether the hand still holds at the end. Their start states
-are drawn for this evaluation by its seed; training had others. Beside the policy a hand that does nothing gets the
-same episodes: what it achieves, too, is no achievement.
+The episodes are the task's own protocol, never restarted: what counts is whether the hand still holds at the end. Their
+start states are drawn by the seed; training had others. A hand that does nothing gets the same episodes: what it
+achieves, too, is no achievement.
 """
 
 import contextlib
@@ -16,7 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,21 +28,14 @@ from dexsim.core.config import Config, override, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
-from dexsim_ppo.acting import PolicyParams, act, initial_carry
+from dexsim_ppo.learner.networks import zero_carry
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
 from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 
 class Evaluator:
-    """Runs evaluation episodes in compiled chunks, so that memory is bounded by the chunk.
-
-    Args:
-      env: the environment.
-      chunk: episodes run side by side.
-    """
-
-    FILMED_S = 60.0
+    """Runs evaluation episodes in compiled chunks of so many side by side, by which memory is bounded."""
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
@@ -65,7 +57,9 @@ class Evaluator:
         """
         started, parts = time.perf_counter(), list[Any]()
         count = math.ceil(episodes / self.chunk) * self.chunk
-        plan = self._plan(count, seed)
+        if (count, seed) not in self._plans:  # kept, since a run selects its best policy on the same ones
+            self._plans[count, seed] = self.protocol.evaluation_plan(count, seed)
+        plan = self._plans[count, seed]
         with progress(label, count, "episodes") if label else contextlib.nullcontext() as show:
             for i in range(0, count, self.chunk):
                 part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
@@ -78,12 +72,6 @@ class Evaluator:
         report = make_report(self.protocol, metrics, over, np.asarray(plan.row))
         report |= {"seed": seed, "seconds": time.perf_counter() - started}
         return report, self._film(*parts[0][1])
-
-    def _plan(self, count: int, seed: int) -> Any:
-        """The episodes; kept, since a run selects its best policy on the same ones again and again."""
-        if (count, seed) not in self._plans:
-            self._plans[count, seed] = self.protocol.evaluation_plan(count, seed)
-        return self._plans[count, seed]
 
     def _episodes(self, params: PolicyParams, plan: Any, idle: bool):
         """One chunk: what the report needs, and snapshots and termination flags [T, shown].
@@ -108,24 +96,21 @@ class Evaluator:
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        first: Any = state, initial_carry(params, (self.chunk,)), last
+        first: Any = state, zero_carry(params.memory, (self.chunk,)), last
         (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
     def _extremes(self, state: Any) -> jax.Array:
         """Two episodes [2] of a chunk: those of the lowest and the highest command, or the first and the last where
         all are equal or there is none."""
-        first_and_last = jnp.array([0, self.chunk - 1])
-        command = getattr(jax.vmap(self.protocol.snapshot)(state), "command", None)
-        if command is None:
-            return first_and_last
+        command = getattr(jax.vmap(self.protocol.snapshot)(state), "command", jnp.zeros(self.chunk))
         command = command.reshape(self.chunk, -1).sum(-1)
         ends = jnp.stack([jnp.argmin(command), jnp.argmax(command)])
-        return jnp.where(ends[0] == ends[1], first_and_last, ends)
+        return jnp.where(ends[0] == ends[1], jnp.array([0, self.chunk - 1]), ends)
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
-        """The shown episodes one after another, each to half a second after it terminated."""
-        after, longest = (round(s / self.env.control_period) for s in (0.5, self.FILMED_S))
+        """The shown episodes one after another, each to half a second after it terminated, and a minute at most."""
+        after, longest = (round(seconds / self.env.control_period) for seconds in (0.5, 60.0))
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
         ends = [min(end, longest) for end in ends]
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
@@ -183,9 +168,7 @@ def evaluate_policy(
     Raises:
       CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
-    arguments = EvaluateArguments(
-        policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk, baseline=baseline
-    )
+    arguments = EvaluateArguments(policy="", episodes=episodes, seed=seed, chunk=chunk, baseline=baseline)
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     if env is None:
         env = policy.make_env(backend=backend)
@@ -205,7 +188,7 @@ class EvaluateArguments(Config):
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
-    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise mjx."""
     chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)
@@ -230,23 +213,18 @@ class EvaluateArguments(Config):
     """quick: 640 x 480 and few frames. talk: 1920 x 1080 at 30 frames a second, which takes minutes."""
 
 
-def chunk_of(arguments: EvaluateArguments) -> int:
-    """Episodes that run side by side, by default those that suit the device."""
-    default = 1024 if jax.default_backend() == "gpu" else 64
-    return min(arguments.chunk or default, arguments.episodes or default)
-
-
-def default_episodes(env: Environment) -> int:
-    """Episodes of an evaluation on the device found: 1024 on a GPU, on a CPU what about a minute suffices for."""
-    if jax.default_backend() == "gpu":
-        return 1024
-    return 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
+def sizes(env: Environment, arguments: EvaluateArguments) -> tuple[int, int]:
+    """Number of episodes, and how many run side by side: on a CPU by default what about a minute suffices for."""
+    chunk, episodes = 1024, 1024
+    if jax.default_backend() != "gpu":
+        chunk, episodes = 64, 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
+    return arguments.episodes or episodes, min(arguments.chunk or chunk, arguments.episodes or chunk)
 
 
 def _measure(policy: Policy, env: Environment, arguments: EvaluateArguments, label: str = "") -> tuple[dict, Any]:
     """The report, with that of a hand that does nothing, and the film."""
-    evaluator, episodes = Evaluator(env, chunk_of(arguments)), arguments.episodes or default_episodes(env)
-    measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
+    episodes, chunk = sizes(env, arguments)
+    measure = functools.partial(Evaluator(env, chunk), policy.params, episodes=episodes, seed=arguments.seed)
     report, film = measure(label=label)
     if arguments.baseline:
         report["do_nothing"], _ = measure(idle=True, label=label and "doing nothing")

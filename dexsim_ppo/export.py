@@ -1,14 +1,11 @@
-"""Writes a policy for programs without JAX.
+"""Writes a policy as an ONNX model (extra `onnx`), which takes observations in SI units.
 
-    python -m dexsim_ppo.export grasp --output grasp.npz     # NumPy alone (`dexsim_ppo.portable`)
-    python -m dexsim_ppo.export grasp --output grasp.onnx    # any ONNX runtime (extra `onnx`)
+    python -m dexsim_ppo.export grasp --output grasp.onnx
 
-Both hold the observation's normalisation, so they take observations in SI units. `load_policy` and
-`python -m dexsim_real.run` take the NumPy file in place of a policy's own.
+`dexsim_ppo.portable` runs a policy's own file without JAX.
 """
 
 import dataclasses
-import io
 import json
 import sys
 from collections.abc import Sequence
@@ -19,26 +16,12 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_whole
 from dexsim.core.install import require
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.portable import FORMAT
 
 _OPSET = 17
 _KEY = "dexsim"  # of the header among the model's properties
-
-
-def header_of(policy: Policy) -> str:
-    """The header of either format, JSON; see `dexsim_ppo.portable`."""
-    return json.dumps({"format": FORMAT, "task": policy.task} | cli.plain(policy.header()))
-
-
-def to_numpy(policy: Policy, path: Path) -> None:
-    """Write a file for `PortablePolicy`."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, header=np.array(header_of(policy)), **policy.arrays())
-    write_whole(path, [buffer.getvalue()])
 
 
 def to_onnx(policy: Policy, path: Path) -> None:
@@ -92,7 +75,8 @@ def to_onnx(policy: Policy, path: Path) -> None:
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
     graph = helper.make_graph(nodes, policy.task, inputs, outputs, tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8)
-    helper.set_model_props(model, {_KEY: header_of(policy)})
+    header = json.dumps({"task": policy.task} | cli.plain(policy.header()))
+    helper.set_model_props(model, {_KEY: header})
     checker.check_model(model)
     write_whole(path, [model.SerializeToString()])
 
@@ -119,7 +103,7 @@ class ExportArguments:
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
     output: Path
-    """File to write: .npz for NumPy alone, .onnx for ONNX."""
+    """File to write."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,14 +112,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         ExportArguments,
         sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim_ppo.export",
-        description="Write a policy for programs without JAX.",
+        description="Write a policy as an ONNX model.",
     )
-    writers = {".npz": to_numpy, ".onnx": to_onnx}
-    if arguments.output.suffix not in writers:
-        raise ConfigError(f"--output {arguments.output}: give a file that ends in {' or '.join(writers)}")
     cli.check_writable(arguments.output)
     policy = load_policy(arguments.policy)
-    writers[arguments.output.suffix](policy, arguments.output)
+    to_onnx(policy, arguments.output)
     sizes = ", ".join(f"{entry.name} {entry.size}" for entry in policy.observation_layout)
     print(f"{arguments.output}: {policy.task}, {policy.control_rate:g} Hz; observation: {sizes}")
     return 0

@@ -10,7 +10,6 @@ rate.
 
 import dataclasses
 import warnings
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,41 +21,60 @@ from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.layout import LayoutEntry, layout_size
-from dexsim.core.pytree import Array
+from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
-from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.memory import GRU
-from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer
+from dexsim_ppo.learner.networks import GRU, MLP, Layer, apply_mlp, carry_size, step_memory, zero_carry
+from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.portable import PortablePolicy
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
     from dexsim.hand.kinematics import Hand
 
-_GRU = ("input_kernel", "input_bias", "recurrent_kernel", "recurrent_bias")
+
+@pytree_dataclass
+class PolicyParams:
+    """What `act` needs."""
+
+    layers: MLP
+    normalizer: Normalizer
+    memory: GRU | None = None
+
+
+def act(params: PolicyParams, carry: jax.Array | None, obs: jax.Array) -> tuple[jax.Array | None, jax.Array]:
+    """One step of a policy, with or without memory, for use under `jit`, `vmap` and `scan`.
+
+    Args:
+      params: `policy.params`.
+      carry: `[..., m]` from the step before; at the start of an episode `policy.initial_carry(...)`.
+      obs: actor observation `[..., n]`, SI units.
+
+    Returns:
+      The next carry `[..., m]`, and the policy's mode: action `[..., A]` in [-1, 1].
+
+    Raises:
+      ConfigError: the observation has another size, or the carry is not that of this policy and batch.
+    """
+    size, shape = params.normalizer.mean.size, np.shape(obs)
+    carried = None if params.memory is None else (*shape[:-1], carry_size(params.memory))
+    given = None if carry is None else np.shape(carry)
+    if shape[-1:] != (size,) or given != carried:
+        raise ConfigError(
+            f"expected an actor observation [..., {size}] and a carry of the shape {carried}, got {shape} and {given}: "
+            "begin an episode with carry = policy.initial_carry(number of environments)"
+        )
+    carry, features = step_memory(params.memory, carry, normalize(params.normalizer, obs))
+    return carry, jnp.clip(apply_mlp(params.layers, features), -1.0, 1.0)
+
+
 _act = jax.jit(act)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PolicyHeader(Config):
-    """What the file of a policy says beside its numbers, in every format; see `Policy`."""
-
-    env_config: dict[str, Any]
-    control_rate: float = setting(dataclasses.MISSING, unit="Hz", low=1.0, high=1000.0)
-    observation_layout: tuple[tuple[str, int, float | None], ...]
-    clip: float = setting(dataclasses.MISSING, unit="1", low=0.1, high=1e4)
-    training: dict[str, Any]
-    spec: TaskSpec | None
-    hand: dict[str, Any] | None
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Policy:
+class Policy(Config):
     """A deterministic policy and what one must know to use it."""
 
     task: str
@@ -65,7 +83,7 @@ class Policy:
     observation_layout: tuple[LayoutEntry, ...]
     """Layout of the actor's observation."""
     params: PolicyParams
-    control_rate: float
+    control_rate: float = setting(unit="Hz", low=1.0, high=1000.0)
     """Actions per second, Hz."""
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Where it comes from: seed, steps, learner settings."""
@@ -77,24 +95,17 @@ class Policy:
     def initial_carry(self, *batch: int) -> jax.Array | None:
         """The carry `[*batch, m]` at the start of an episode, such as `initial_carry(8)` of eight environments; None
         for a policy without memory."""
-        return initial_carry(self.params, batch)
+        return zero_carry(self.params.memory, batch)
 
     def act(self, carry: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
         """The next carry `[..., m]` and the action `[..., A]` for an actor observation `[..., n]`: the compiled
-        `dexsim_ppo.act(self.params, carry, obs)`.
-
-        Raises:
-          ConfigError: the observation has another size, or the carry is not that of this policy and batch.
-        """
+        `dexsim_ppo.act(self.params, carry, obs)`."""
         return _act(self.params, carry, obs)
 
     def ablate(self, *names: str) -> "Policy":
         """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.
 
         Shows what the policy relies on. A policy that was trained without those fields may do better.
-
-        Raises:
-          ConfigError: it observes no such field.
         """
         known = sorted(entry.name for entry in self.observation_layout)
         if unknown := sorted(set(names) - set(known)):
@@ -109,16 +120,9 @@ class Policy:
         return dataclasses.replace(self, params=params)
 
     def header(self) -> dict[str, Any]:
-        """What its file says beside the numbers: a `PolicyHeader` as plain data."""
-        return {
-            "env_config": self.env_config,
-            "control_rate": self.control_rate,
-            "observation_layout": [list(entry) for entry in self.observation_layout],
-            "clip": self.params.normalizer.clip,
-            "training": self.training,
-            "spec": self.spec and to_dict(self.spec),
-            "hand": self.hand,
-        }
+        """What its file says beside the numbers, as plain data."""
+        names = ("env_config", "observation_layout", "control_rate", "training", "spec", "hand")
+        return {name: to_dict(getattr(self, name)) for name in names} | {"clip": self.params.normalizer.clip}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The numbers of its file by name; see `dexsim_ppo.portable`."""
@@ -127,7 +131,8 @@ class Policy:
         for i, layer in enumerate(params.layers):
             arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
         if params.memory is not None:
-            arrays |= dict(zip(_GRU, jax.tree.leaves(params.memory), strict=True))
+            for part, layer in (("input", params.memory.input), ("recurrent", params.memory.recurrent)):
+                arrays |= {f"{part}_kernel": layer.kernel, f"{part}_bias": layer.bias}
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def save(self, path: str | Path) -> None:
@@ -135,21 +140,13 @@ class Policy:
         checkpoint.save(path, kind="policy", task=self.task, content=self.header(), tree=self.arrays())
 
     def find_hand(self, given: str | Path | None = None) -> "Hand | None":
-        """The hand that the policy was trained on, or the file that is `given`; None for the default one.
-
-        Raises:
-          ConfigError: that hand is not here, its files have changed, or the given one has other joints, fingers or
-            taxels.
-        """
+        """The hand that the policy was trained on, or the file that is `given`; None for the default one. Raises
+        ConfigError if its files have changed, or if the given one has other joints, fingers or taxels."""
         return recorded_hand(self.hand, given, f"the policy of {self.task!r}")
 
     def make_env(self, *, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
-        """The environment that the policy was trained in; arguments as in `dexsim.make`.
-
-        Raises:
-          ConfigError: its task is not registered.
-          CheckpointError: today's task gives another observation.
-        """
+        """The environment that the policy was trained in; arguments as in `dexsim.make`. Raises
+        CheckpointError if today's task gives another observation."""
         from dexsim.registry import find_task, make
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
@@ -159,11 +156,7 @@ class Policy:
         return cast(Any, env)
 
     def check_fit(self, env: Environment) -> None:
-        """Whether the policy can act in an environment.
-
-        Raises:
-          CheckpointError: it observes something else, or takes other actions.
-        """
+        """Raises CheckpointError: the environment gives another observation, or takes other actions."""
         layouts = tuple(env.observation_layout["actor"]), self.observation_layout
         if layouts[0] != layouts[1]:
             given, expected = (", ".join(f"{entry.name} [{entry.size}]" for entry in layout) for layout in layouts)
@@ -172,12 +165,8 @@ class Policy:
             raise CheckpointError(f"{env.name} takes {env.action_size} actions; the policy gives {actions}")
 
     def check_env(self, env: Environment) -> None:
-        """Whether an environment is the one that the policy was trained in; warns (`OtherEnvWarning`) of settings that
-        differ.
-
-        Raises:
-          CheckpointError: the policy cannot act in it; see `check_fit`.
-        """
+        """Warn (`OtherEnvWarning`) of settings that differ from those that the policy was trained with. Raises
+        CheckpointError if it cannot act in this environment."""
         self.check_fit(env)
         today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
         trained, now = flat(to_dict(today)), flat(to_dict(env.config))
@@ -194,13 +183,8 @@ class Policy:
     def from_training(
         cls, env: Environment, config: Any, state: Any, training: dict[str, Any] | None = None
     ) -> "Policy":
-        """The policy that a learner's state stands for.
-
-        Args:
-          config: the `PPOConfig` that it is trained with.
-          state: a `TrainState`; its arrays are copied, so the state may be donated afterwards.
-          training: what to remember of its origin.
-        """
+        """The policy of a learner with this `PPOConfig` and `TrainState`, whose arrays are copied; `training` is what
+        to remember of its origin."""
         layout = tuple(env.observation_layout["actor"])
         floor, clip = config.observation_std_floor, config.observation_clip
         normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)
@@ -221,8 +205,7 @@ def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
     """A policy from a file, or a shipped one by its name.
 
     Args:
-      name: path of a file, also of one that `python -m dexsim_ppo.export` wrote for NumPy (.npz), or the name of a
-        shipped policy.
+      name: path of a file, or the name of a shipped policy.
       task: the policy's task, or another name that it is registered under; with its module (`my_module:poke`) where
         that has to be imported. None takes any.
 
@@ -230,14 +213,15 @@ def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
       CheckpointError: there is no such policy, it is of another task, or its file is unsound.
     """
     path = _find(name)
+    file = checkpoint.load(path, kind="policy")
     try:
-        policy = _read_npz(path) if path.suffix == ".npz" else _read(path)
+        policy = _from_file(file)
         jax.eval_shape(act, policy.params, policy.initial_carry(), np.zeros(layout_size(policy.observation_layout)))
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ConfigError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: invalid policy: {' '.join(str(error).split()):.300}") from None
-    check_finite(policy.params, path)
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy.params))
+    if not finite or not (policy.params.normalizer.std > 0).all():
+        raise CheckpointError(f"{path}: holds numbers that are not finite, or deviations that are not positive")
     if task:
         from dexsim.registry import find_task
 
@@ -248,44 +232,31 @@ def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
     return policy
 
 
-def check_finite(params: PolicyParams, where: object) -> None:
-    """Raises CheckpointError: a number of the policy is not finite, or a deviation not positive."""
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params)) or not (params.normalizer.std > 0).all():
-        raise CheckpointError(f"{where}: holds numbers that are not finite, or deviations that are not positive")
+def _find(name: str | Path) -> Path:
+    """The file of a policy that is named by a path, or by the name of a shipped one."""
+    path, text = Path(name), str(name)
+    if path.is_file() or "/" in text or path.suffix == ".msgpack":
+        return path
+    try:
+        return Path(asset_path(f"policies/{text}.msgpack"))
+    except AssetError:
+        shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
+        raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None
 
 
-def _read(path: Path) -> Policy:
-    file = checkpoint.load(path, kind="policy")
+def _from_file(file: checkpoint.Checkpoint) -> Policy:
     # The path of a dictionary's leaf is ['mean'].
-    return _from_file(file.task, file.content, {path.strip("[']"): array for path, array in file.leaves.items()})
-
-
-def _read_npz(path: Path) -> Policy:
-    file = PortablePolicy.load(path)
-    header = {name: value for name, value in file.header.items() if name not in ("format", "task")}
-    return _from_file(file.task, header, file.arrays)
-
-
-def _from_file(task: str, data: dict[str, Any], arrays: dict[str, np.ndarray]) -> Policy:
-    """The policy that a header and arrays by name stand for."""
-    header = from_dict(PolicyHeader, data)
-    layer = lambda kernel, bias: Layer(jnp.asarray(arrays[kernel]), jnp.asarray(arrays[bias]))  # noqa: E731
+    arrays = {path.strip("[']"): jnp.asarray(array) for path, array in file.leaves.items()}
+    layer = lambda kernel, bias: Layer(arrays[kernel], arrays[bias])  # noqa: E731
     count = sum(name.startswith("kernel_") for name in arrays)
-    normalizer = Normalizer(jnp.asarray(arrays["mean"]), jnp.asarray(arrays["std"]), header.clip)
-    return Policy(
-        task=task,
-        env_config=header.env_config,
-        observation_layout=tuple(LayoutEntry(*entry) for entry in header.observation_layout),
-        params=PolicyParams(
-            tuple(layer(f"kernel_{i}", f"bias_{i}") for i in range(count)),
-            normalizer,
-            GRU(layer(*_GRU[:2]), layer(*_GRU[2:])) if _GRU[0] in arrays else None,
-        ),
-        control_rate=header.control_rate,
-        training=header.training,
-        spec=header.spec,
-        hand=header.hand,
-    )
+    memory = None
+    if "recurrent_kernel" in arrays:
+        memory = GRU(layer("input_kernel", "input_bias"), layer("recurrent_kernel", "recurrent_bias"))
+    header = dict(file.content)
+    normalizer = Normalizer(arrays["mean"], arrays["std"], header.pop("clip"))
+    params = PolicyParams(tuple(layer(f"kernel_{i}", f"bias_{i}") for i in range(count)), normalizer, memory)
+    layout = tuple(LayoutEntry(*entry) for entry in header.pop("observation_layout"))
+    return Policy(task=file.task, observation_layout=layout, params=params, **header)
 
 
 def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
@@ -293,15 +264,3 @@ def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
     mask = np.ones(len(layer.kernel), np.float32)
     mask[: keep.size] = keep
     return dataclasses.replace(layer, kernel=layer.kernel * mask[:, None])
-
-
-def _find(name: str | Path) -> Path:
-    """The file of a policy that is named by a path, or by the name of a shipped one."""
-    path, text = Path(name), str(name)
-    if path.is_file() or "/" in text or path.suffix in (".msgpack", ".npz"):
-        return path
-    try:
-        return Path(asset_path(f"policies/{text}.msgpack"))
-    except AssetError:
-        shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
-        raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None

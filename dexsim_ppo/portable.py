@@ -1,36 +1,53 @@
-"""A policy in a file that needs NumPy alone: no JAX, no simulator, nothing else of this library.
+"""Policies without JAX: reads and runs a policy's file with NumPy and msgpack alone.
 
-    policy = PortablePolicy.load("grasp.npz")   # written by `python -m dexsim_ppo.export`
+    policy = PortablePolicy.load("runs/grasp/best.msgpack")
     carry = policy.initial_carry()              # at an episode's start; None where the policy has no memory
     carry, action = policy.act(carry, observation)
 
-This module imports only NumPy and may be copied to a computer that has nothing else.
+This module imports nothing else of this library and may be copied to a computer that has nothing else.
 
-The file is a NumPy archive without pickles: `header` (JSON: task, control rate, observation layout, clip), `mean` and
-`std` [n] of the observation, and `kernel_0` [in, out], `bias_0` [out] and so on for every layer. A gated recurrent unit
-has `input_kernel`, `input_bias`, `recurrent_kernel` and `recurrent_bias`: reset gate, update gate, candidate.
+The format of policies and checkpoints:
+
+    offset  size  content
+    0       6     magic, b"DEXSIM"
+    6       2     format version, little-endian like all integers
+    8       8     length of the header, n
+    16      32    SHA-256 of all other bytes
+    48      n     header: msgpack map with "kind", "task", "content" (what the kind needs) and
+                  "leaves" (path, dtype, shape, PRNG implementation)
+    48 + n        payload: the leaves' bytes in C order, one after another
+
+A policy's leaves are `mean` and `std` [n] of the observation, and `kernel_0` [in, out], `bias_0` [out] and so on for
+every layer. A gated recurrent unit has `input_kernel`, `input_bias`, `recurrent_kernel` and `recurrent_bias`: reset
+gate, update gate, candidate.
 """
 
-import json
+import hashlib
+import math
+import struct
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 
-FORMAT = "dexsim policy 3"
+MAGIC = b"DEXSIM"
+FORMAT_VERSION = 2
+PREFIX = struct.Struct("<6sHQ")
+_START = PREFIX.size + hashlib.sha256().digest_size
 
 
 class PortablePolicy:
     """A deterministic policy.
 
     Args:
-      header: as in the file.
-      arrays: as in the file, by name.
+      task: what it was trained for.
+      header: what its file says beside the numbers.
+      arrays: the numbers by name.
     """
 
-    def __init__(self, header: dict[str, Any], arrays: dict[str, np.ndarray]):
-        self.header, self.arrays = header, arrays
-        self.task: str = header["task"]
+    def __init__(self, task: str, header: dict[str, Any], arrays: dict[str, np.ndarray]):
+        self.task, self.header, self.arrays = task, header, arrays
         self.control_rate: float = header["control_rate"]
         """Actions per second, Hz."""
         self.observation_layout: list[list[Any]] = header["observation_layout"]
@@ -40,18 +57,10 @@ class PortablePolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> "PortablePolicy":
-        """Read a file.
-
-        Raises:
-          ValueError: it is none of this format.
-          OSError: it cannot be read.
-        """
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop("header")))
-        if header["format"] != FORMAT:
-            raise ValueError(f"expected the format {FORMAT!r}, got {header['format']!r}")
-        return cls(header, arrays)
+        """Read a file; errors as of `read_file`."""
+        file, leaves = read_file(path, "policy")
+        # The path of a dictionary's leaf is ['mean'].
+        return cls(file["task"], file["content"], {path.strip("[']"): array for path, array in leaves.items()})
 
     def initial_carry(self, *batch: int) -> np.ndarray | None:
         """The carry [*batch, m] at the start of an episode; None for a policy without memory."""
@@ -78,3 +87,38 @@ class PortablePolicy:
         # The logistic function by tanh, which does not overflow.
         reset, update = (0.5 + 0.5 * np.tanh(0.5 * (a + b)) for a, b in zip(now[:2], past[:2], strict=True))
         return update * carry + (1 - update) * np.tanh(now[2] + reset * past[2])
+
+
+def read_file(path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header of a file, and its arrays by path. Nothing is executed.
+
+    Raises:
+      ValueError: not of this format or version, cut short, altered, or of another kind.
+      OSError: it cannot be read.
+    """
+    data = memoryview(Path(path).read_bytes())
+    if bytes(data[: len(MAGIC)]) != MAGIC:
+        raise ValueError("is not a dexsim checkpoint or policy")
+    if len(data) < _START:
+        raise ValueError("is cut short")
+    _, version, size = PREFIX.unpack_from(data)
+    if version != FORMAT_VERSION:
+        raise ValueError(f"has format version {version}, this dexsim reads {FORMAT_VERSION}")
+    if digest(data[: PREFIX.size], data[_START:]) != bytes(data[PREFIX.size : _START]):
+        raise ValueError("is cut short or damaged (its checksum is wrong)")
+    header, offset = msgpack.unpackb(data[_START : _START + size]), _START + size
+    if header["kind"] != kind:
+        raise ValueError(f"is a {header['kind']!r} file, not a {kind!r} file")
+    arrays = {}
+    for leaf in header["leaves"]:
+        array = np.frombuffer(data, leaf["dtype"], math.prod(leaf["shape"]), offset).reshape(leaf["shape"])
+        arrays[leaf["path"]], offset = array, offset + array.nbytes
+    return header, arrays
+
+
+def digest(*parts: Any) -> bytes:
+    """SHA-256 of these bytes, one after another."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part)
+    return total.digest()

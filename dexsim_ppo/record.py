@@ -25,8 +25,7 @@ from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
-from dexsim_ppo.acting import act
-from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.policy import Policy, act, load_policy
 
 
 def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int) -> list[Trajectory]:

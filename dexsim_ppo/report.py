@@ -8,10 +8,9 @@ from dexsim.core import statistics
 
 
 def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
+    """Report of episodes from their metrics [T, N], termination flags [T, N] and starts [N].
 
-    An episode lives up to, and not including, its first terminated step. That step's reward belongs to
-    the return, and nothing after it counts.
+    An episode lives up to, and not including, its first terminated step, whose reward belongs to the return.
     """
     steps, episodes = terminated.shape
     alive = ~np.logical_or.accumulate(terminated, axis=0)

@@ -20,26 +20,23 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import numpy as np
-
 from dexsim.core import cli
 
 if __name__ == "__main__":
     cli.announce(cli.LOADING)
 
+import dexsim
 from dexsim.catalog import catalog
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
-from dexsim.hand.kinematics import Hand
+from dexsim.core.install import require
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.sharding import make_mesh
-from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import (
@@ -52,8 +49,11 @@ from dexsim_ppo.training.arguments import (
 )
 from dexsim_ppo.training.fine_tune import check_network, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
-from dexsim_ppo.training.runlog import RunFolder, check_wandb, draw_curve, folder_of, new_folder, read_metrics, taken
+from dexsim_ppo.training.runlog import RunFolder, check_new, folder_of, new_folder
 from dexsim_ppo.training.trainer import Run
+
+Source = checkpoint.Checkpoint | Policy | None
+"""What a run begins from: the checkpoint to resume, the policy to fine-tune, or nothing."""
 
 
 class TrainResult(NamedTuple):
@@ -96,11 +96,11 @@ def train_policy(
     """
     started = time.perf_counter()
     cli.enable_caches()
-    source = find_source(task, str(policy or ""), resume)
+    source = find_source(task, str(policy), resume)
     if not (task or source):
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
-    given = {"env": config, "ppo": ppo, "policy": str(policy or "") or None, "resume": resume and Path(resume)}
+    given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)}
     if "steps" in options and "minutes" not in options:
         given["minutes"] = 0.0
     if options.get("run_dir"):
@@ -109,8 +109,6 @@ def train_policy(
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
     if isinstance(source, checkpoint.Checkpoint):
         check_resumed(arguments, default)
-    if arguments.seeds > 1:
-        raise ConfigError(f"train_policy(seeds={arguments.seeds}): trains one seed; call it once for each")
     run = make_run(arguments, source, started, "train_policy(...)")
     if train_run(run, source, "train_policy(...)"):
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -123,7 +121,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     given = {argument.split("=")[0] for argument in argv}
     if not given & {"--task", "--resume", "--policy", "--config", "-h", "--help"}:
-        print(overview(), file=sys.stderr)
+        print(
+            f"give a task: {', '.join(catalog()['tasks'])}\n"
+            "for example: python -m dexsim_ppo.train --task grasp\n"
+            "or a run to continue (--resume), a policy to fine-tune (--policy), a run whose options to use (--config); "
+            "--help lists all options",
+            file=sys.stderr,
+        )
         return 2
     cli.enable_caches()
     if "--devices" in given:
@@ -131,196 +135,59 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     with processes.exit_on_error():
         arguments, source = parse_arguments(argv)
-        if arguments.seeds > 1:
-            run, stopped = train_seeds(arguments, source, started, command)
-        else:
-            run = make_run(arguments, source, started, command)
-            stopped = train_run(run, source, command)
-    if stopped and processes.is_first():
-        print(
-            f"stopped by {signal.Signals(stopped).name}; resume with: "
-            f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}{task_option(run.arguments.task)}"
-        )
-    return 128 + stopped if stopped else 0
-
-
-def overview() -> str:
-    """What there is to train, for a command line that does not say it."""
-    return (
-        f"give a task: {', '.join(catalog()['tasks'])}\n"
-        "for example: python -m dexsim_ppo.train --task grasp\n"
-        "or a run to continue (--resume), a policy to fine-tune (--policy), a run whose options to use (--config); "
-        "--help lists all options"
+        run = make_run(arguments, source, started, command)
+        stopped = train_run(run, source, command)
+    if not stopped:
+        return 0
+    processes.say(
+        f"stopped by {signal.Signals(stopped).name}; resume with: "
+        f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}{task_option(arguments.task)}"
     )
+    return 128 + stopped
 
 
-def make_run(
-    arguments: TrainArguments,
-    source: checkpoint.Checkpoint | Policy | None,
-    started: float,
-    command: str,
-    like: Run | None = None,
-) -> Run:
-    """A run with its folder, ready to train; with the environment and the evaluator of another seed's run `like` it."""
+def make_run(arguments: TrainArguments, source: Source, started: float, command: str) -> Run:
+    """A run with its folder, ready to train."""
     resumed, first = source if isinstance(source, checkpoint.Checkpoint) else None, processes.is_first()
-    if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
-        raise taken(arguments.run_dir)
-    check_wandb(arguments.wandb)
-    if arguments.deterministic and not make_deterministic() and first:
-        print("--deterministic changes nothing here: without a GPU, trainings repeat to the last bit anyway")
+    # What is wrong is said before the environment is made.
+    if resumed and arguments.run_dir:
+        raise ConfigError(f"--run-dir {arguments.run_dir}: a resumed run stays in its folder")
+    if first:
+        check_new(arguments.run_dir)
+    if arguments.wandb:
+        require("wandb", "wandb", f"--wandb {arguments.wandb}")
+    if arguments.deterministic and not make_deterministic():
+        processes.say("--deterministic changes nothing here: without a GPU, runs repeat to the last bit anyway")
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, source)
-    if first and not like:
-        print(f"making the environment of {arguments.task}", flush=True)
-    env = like.env if like else make_environment(arguments, hand)
+    processes.say(f"making the environment of {arguments.task}")
+    made = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend, hand=hand)
+    env = adapt(made, arguments.task)
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
     if isinstance(source, Policy):
         source.check_fit(env)
         check_network(source, arguments.ppo)
-    path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
-    folder = RunFolder(processes.agree_on_path(path))
+    path = Path()  # Only the first process writes.
+    if resumed:
+        path = folder_of(resumed.path)
+    elif first:
+        path = new_folder(arguments.run_dir, arguments.task)
+    folder = RunFolder(path)
     if first and not resumed:
         folder.checkpoints.mkdir()
         record = {"command": command, "arguments": printable(arguments), "hand": record_of(hand)}
         cli.write_json(folder.config, record | cli.environment_report())
-    return Run(env, arguments, folder, started, mesh, like.evaluator if like else None)
+    return Run(env, arguments, folder, started, mesh)
 
 
-def make_environment(arguments: TrainArguments, hand: Hand | None) -> Environment:
-    """The environment to train in."""
-    import dexsim
-
-    made = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend, hand=hand)
-    return adapt(made, arguments.task)
-
-
-def train_run(run: Run, source: checkpoint.Checkpoint | Policy | None, command: str) -> int:
+def train_run(run: Run, source: Source, command: str) -> int:
     """Train, then evaluate and report; the number of the signal that stopped it or 0."""
-    with stop_on_signals() as received, processes.detect_lost_peer(run.folder.path):
+    with stop_on_signals() as received:
         run.train(source, lambda: processes.agree(received()))
         stopped = processes.agree(received())
     if processes.is_first() and not stopped:
         run.finish(command)
     return stopped
-
-
-def train_seeds(
-    arguments: TrainArguments, source: checkpoint.Checkpoint | Policy | None, started: float, command: str
-) -> tuple[Run, int]:
-    """Train several seeds in turn, then write `report.json` of their spread and a curve of all. The last run to be
-    trained, and the signal that stopped it or 0."""
-    first, runs = processes.is_first(), list[Run]()
-    folder = processes.agree_on_path(new_folder(arguments.run_dir, arguments.task) if first else Path())
-    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=folder / f"seed-{seed}")
-        runs.append(make_run(one, source, started, command, runs[0] if runs else None))
-        if stopped := train_run(runs[-1], source, command):
-            return runs[-1], stopped
-        started = time.perf_counter()
-    if first:
-        reports = {run.arguments.seed: json.loads(run.folder.report.read_text()) for run in runs}
-        measures = ("held", "return", "steps_held")
-        report = {
-            "task": arguments.task,
-            "seeds": list(reports),
-            "trained": {name: spread([r["trained"][name]["value"] for r in reports.values()]) for name in measures},
-            "policies": {seed: f"seed-{seed}/{report['policy']}" for seed, report in reports.items()},
-            "command": command,
-        }
-        cli.write_json(folder / "report.json", report | cli.environment_report())
-        draw_curve([read_metrics(run.folder.metrics) for run in runs], folder / "curve.png", arguments.task)
-        print(f"report of {arguments.seeds} seeds: {folder / 'report.json'}")
-    return runs[-1], 0
-
-
-def spread(values: Sequence[float | None]) -> dict[str, Any]:
-    """Mean, sample standard deviation, extremes and the values themselves, one for each seed; those that are not
-    finite, None in a report, count in the values alone."""
-    x = np.array(values, float)
-    mean, std = np.nanmean(x), np.nanstd(x, ddof=1)
-    return {"mean": mean, "std": std, "min": np.nanmin(x), "max": np.nanmax(x), "values": list(values)}
-
-
-# --- options ------------------------------------------------------------------------------------------
-
-
-def find_source(
-    task: str | None, policy: str | None, resume: str | Path | None
-) -> checkpoint.Checkpoint | Policy | None:
-    """What a run begins from: the checkpoint to resume, the policy to fine-tune, or nothing."""
-    if task:
-        find_task(task)
-    if resume and policy:
-        raise ConfigError("--policy begins a run and --resume resumes one: give one of them")
-    if resume:
-        path = Path(resume)
-        file = path if path.is_file() else RunFolder(path).latest_checkpoint()
-        return checkpoint.load(file, kind="train", task=task and task.rpartition(":")[2])
-    return load_policy(policy, task=task) if policy else None
-
-
-def default_arguments(task: str | None, preset: str, source: checkpoint.Checkpoint | Policy | None) -> TrainArguments:
-    """The options' defaults: the preset's, or those of what the run begins from."""
-    name = source.task if source else (task or "grasp").rpartition(":")[2]
-    entry = find_task(name)
-    if isinstance(source, checkpoint.Checkpoint):
-        with naming_file(source.path):
-            return arguments_from_dict(entry.config_class, source.content["arguments"])
-    default = preset_arguments(name, entry.config(), preset)
-    if source:
-        env = from_dict(entry.config_class, source.env_config)
-        ppo, hand = fine_tuning_config(source, default.ppo), source.hand["file"] if source.hand else ""
-        default = dataclasses.replace(default, env=env, ppo=ppo, curriculum=CurriculumConfig(), hand=hand)
-    return default
-
-
-def saved_arguments(path: Path, task: str | None) -> TrainArguments:
-    """The options in `config.json` of a run, or of the run in this folder.
-
-    Raises:
-      ConfigError: it is no such file, or of another task than the one given.
-    """
-    file = RunFolder(path).config if path.is_dir() else path
-    try:
-        saved = json.loads(file.read_text())["arguments"]
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
-    if task and task.rpartition(":")[2] != saved["task"]:
-        raise ConfigError(f"--config {path}: is of the task {saved['task']!r}, not {task!r}")
-    with naming_file(file):
-        return arguments_from_dict(find_task(task or saved["task"]).config_class, saved)
-
-
-def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
-    """The command's options, and what the run begins from."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in ("--task", "--preset", "--resume", "--policy", "--config"):
-        early.add_argument(name, nargs="?")
-    known, _ = early.parse_known_args(argv)
-    preset, description = known.preset or "auto", "Train a task."
-    if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
-        preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
-    if known.config:
-        if known.resume or known.preset:
-            raise ConfigError("--config has all options of a new run: leave --resume and --preset out")
-        default = saved_arguments(Path(known.config), known.task)
-        source = find_source(known.task or default.task, known.policy or default.policy, None)
-        if known.policy and not default.policy:  # the run began from scratch
-            ppo = fine_tuning_config(cast(Policy, source), default.ppo)
-            default = dataclasses.replace(default, ppo=ppo, curriculum=CurriculumConfig())
-    else:
-        source = find_source(known.task, known.policy, known.resume)
-        default = default_arguments(known.task, preset, source)
-    given = {argument.split("=")[0] for argument in argv}
-    if "--steps" in given and "--minutes" not in given:
-        default = dataclasses.replace(default, minutes=0.0)
-    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
-    options = generic[type(default.env)]
-    arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
-    arguments = dataclasses.replace(arguments, task=default.task)
-    if isinstance(source, checkpoint.Checkpoint):
-        check_resumed(arguments, default)
-    return arguments, source
 
 
 @contextlib.contextmanager
@@ -339,6 +206,82 @@ def stop_on_signals() -> Iterator[Callable[[], int]]:
     finally:
         for number, previous in old.items():
             signal.signal(number, previous)
+
+
+# --- options ------------------------------------------------------------------------------------------
+
+
+def find_source(task: str | None, policy: str | None, resume: str | Path | None) -> Source:
+    """What a run begins from."""
+    if task:
+        find_task(task)
+    if resume and policy:
+        raise ConfigError("--policy begins a run and --resume resumes one: give one of them")
+    if resume:
+        path = Path(resume)
+        file = path if path.is_file() else RunFolder(path).latest_checkpoint()
+        return checkpoint.load(file, kind="train", task=task and task.rpartition(":")[2])
+    return load_policy(policy, task=task) if policy else None
+
+
+def default_arguments(task: str | None, preset: str, source: Source) -> TrainArguments:
+    """The options' defaults: the preset's, or those of what the run begins from."""
+    name = source.task if source else (task or "grasp").rpartition(":")[2]
+    entry = find_task(name)
+    if isinstance(source, checkpoint.Checkpoint):
+        with naming_file(source.path):
+            return arguments_from_dict(entry.config_class, source.content["arguments"])
+    default = preset_arguments(name, entry.config(), preset)
+    if source:
+        env = from_dict(entry.config_class, source.env_config)
+        ppo, hand = fine_tuning_config(source, default.ppo), source.hand["file"] if source.hand else ""
+        default = dataclasses.replace(default, env=env, ppo=ppo, curriculum=CurriculumConfig(), hand=hand)
+    return default
+
+
+def saved_arguments(path: Path, task: str | None) -> TrainArguments:
+    """The options in `config.json` of a run, or of the run in this folder. Raises ConfigError if of another task."""
+    file = RunFolder(path).config if path.is_dir() else path
+    try:
+        saved = json.loads(file.read_text())["arguments"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
+    if task and task.rpartition(":")[2] != saved["task"]:
+        raise ConfigError(f"--config {path}: is of the task {saved['task']!r}, not {task!r}")
+    with naming_file(file):
+        return arguments_from_dict(find_task(task or saved["task"]).config_class, saved)
+
+
+def parse_arguments(argv: list[str]) -> tuple[TrainArguments, Source]:
+    """The command's options, and what the run begins from."""
+    # The defaults of all options depend on these.
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name in ("--task", "--preset", "--resume", "--policy", "--config", "--steps", "--minutes"):
+        early.add_argument(name, nargs="?")
+    given, _ = early.parse_known_args(argv)
+    preset, description = given.preset or "auto", "Train a task."
+    if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
+        preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
+    if given.config:
+        if given.resume or given.preset:
+            raise ConfigError("--config has all options of a new run: leave --resume and --preset out")
+        default = saved_arguments(Path(given.config), given.task)
+        source = find_source(given.task or default.task, given.policy or default.policy, None)
+        if given.policy and not default.policy:  # the run began from scratch
+            ppo = fine_tuning_config(cast(Policy, source), default.ppo)
+            default = dataclasses.replace(default, ppo=ppo, curriculum=CurriculumConfig())
+    else:
+        source = find_source(given.task, given.policy, given.resume)
+        default = default_arguments(given.task, preset, source)
+    if given.steps and not given.minutes:
+        default = dataclasses.replace(default, minutes=0.0)
+    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
+    options = generic[type(default.env)]
+    arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
+    arguments = dataclasses.replace(arguments, task=default.task)
+    if isinstance(source, checkpoint.Checkpoint):
+        check_resumed(arguments, default)
+    return arguments, source
 
 
 if __name__ == "__main__":

@@ -36,12 +36,11 @@ FLOORS = {
     ),
     "dexsim_ppo": (
         ("learner", "portable"),
-        ("acting", "checkpoint", "report"),
+        ("checkpoint", "report"),
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),
         ("average", "train"),
-        ("reproduce",),
         ("",),
     ),
     "dexsim_real": (

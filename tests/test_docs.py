@@ -37,7 +37,6 @@ COMMANDS = {
     "dexsim_ppo.evaluate": "dexsim_ppo.evaluate:EvaluateArguments",
     "dexsim_ppo.export": "dexsim_ppo.export:ExportArguments",
     "dexsim_ppo.record": "dexsim_ppo.record:RecordArguments",
-    "dexsim_ppo.reproduce": "dexsim_ppo.reproduce:ReproduceArguments",
     "dexsim_real.run": "dexsim_real.run.options:RunArguments",
     "dexsim_real.calibrate": "dexsim_real.calibrate.options:CalibrateArguments",
     "dexsim_real.twin": "dexsim_real.twin.options:TwinArguments",

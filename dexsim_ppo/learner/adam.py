@@ -28,17 +28,9 @@ def init(params: Tree) -> AdamState:
     )
 
 
-def update(
-    grads: Tree,
-    state: AdamState,
-    params: Tree,
-    learning_rate: jax.Array | float,
-    *,
-    decay: tuple[float, float] = (0.9, 0.999),
-    epsilon: float = 1e-5,
-) -> tuple[Tree, AdamState]:
+def update(grads: Tree, state: AdamState, params: Tree, learning_rate: jax.Array | float) -> tuple[Tree, AdamState]:
     """One step down the gradient: new parameters and moments. `learning_rate` is []."""
-    b1, b2 = decay
+    b1, b2, epsilon = 0.9, 0.999, 1e-5
     count = state.count + 1
     mean = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mean, grads)
     variance = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g**2, state.variance, grads)
@@ -51,13 +43,8 @@ def update(
     return jax.tree.map(step, params, mean, variance), AdamState(count, mean, variance)
 
 
-def global_norm(tree: Tree) -> jax.Array:
-    """Euclidean norm [] over all leaves."""
-    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)))
-
-
 def clip_by_global_norm(grads: Tree, max_norm: float) -> tuple[Tree, jax.Array]:
     """Scale gradients longer than `max_norm` down to it; also return the norm [] before clipping."""
-    norm = global_norm(grads)
+    norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(grads)))
     scale = jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
     return jax.tree.map(lambda g: g * scale, grads), norm

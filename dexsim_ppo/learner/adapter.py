@@ -36,12 +36,10 @@ class SimpleEnvironment(Protocol):
 
     def reset(self, key: jax.Array) -> tuple[jax.Array, Any]:
         """Observation [observation_size] and state of a new episode."""
-        ...
 
     def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
         """Observation, state, reward [] and whether the episode terminated [] (bool) after an action [action_size] in
         [-1, 1]. No restart, and no time limit."""
-        ...
 
 
 @pytree_dataclass
@@ -59,7 +57,7 @@ class AdaptedState:
     key: jax.Array
 
 
-class AdaptedPlan(NamedTuple):
+class Plan(NamedTuple):
     """Evaluation episodes: a key for each, and its number."""
 
     key: jax.Array
@@ -67,7 +65,7 @@ class AdaptedPlan(NamedTuple):
 
 
 class Adapted:
-    """A `SimpleEnvironment` as the learner's `Environment`; see `adapt`."""
+    """A `SimpleEnvironment` as the learner's `Environment`, with the members of an evaluation; see `adapt`."""
 
     backend, evaluation, config = "own", "series", NoSettings()
 
@@ -109,11 +107,11 @@ class Adapted:
         """The episode's clock at a random time."""
         return replace(state, clock=jax.random.randint(key, (), 0, self.evaluation_steps))
 
-    def evaluation_plan(self, count: int, seed: int) -> AdaptedPlan:
+    def evaluation_plan(self, count: int, seed: int) -> Plan:
         """`count` episodes, each from a key of its own."""
-        return AdaptedPlan(jax.random.split(jax.random.key(seed), count), np.arange(count))
+        return Plan(jax.random.split(jax.random.key(seed), count), np.arange(count))
 
-    def evaluation_starts(self, plan: AdaptedPlan) -> AdaptedState:
+    def evaluation_starts(self, plan: Plan) -> AdaptedState:
         """The first states of a plan's episodes."""
         return jax.vmap(self.reset)(plan.key)
 
@@ -138,11 +136,8 @@ class Adapted:
 
 
 def adapt(env: Any, name: str = "") -> Environment:
-    """An environment that the learner can train: `env` itself if it is an `Environment`, else a wrapper around it.
-
-    Args:
-      env: an `Environment`, or an object with the members of `SimpleEnvironment`.
-      name: of the task, for reports and policies; that of the environment's class by default.
+    """`env` itself if it is an `Environment`, else a wrapper of a `SimpleEnvironment`; its name is that of its class
+    by default.
 
     Raises:
       ConfigError: a member is missing.

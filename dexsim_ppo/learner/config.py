@@ -1,4 +1,4 @@
-"""Settings of the learner."""
+"""Settings of the learner and of the curriculum."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -96,3 +96,30 @@ class PPOConfig(Config):
     def rows(self) -> int:
         """Rows of experience that minibatches are drawn from: steps, or with a GRU whole rollouts."""
         return self.num_envs if self.memory == "gru" else self.steps_per_iteration
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumConfig(Config):
+    """How the scale of the randomisation ranges follows the success rate. The scale is part of the training state."""
+
+    on: bool = setting(False)
+    """Widen the ranges during training; otherwise they have their full width from the start."""
+    metric: str = setting("")
+    """Training metric that measures success, such as episode/successes. Empty: the share of ended episodes that
+    reached their time limit."""
+    start: float = setting(0.1, unit="1", low=0.0, high=1.0)
+    """Initial scale."""
+    widen_above: float = setting(0.8, unit="1", low=0.0, high=1e6)
+    """Success at or above which the ranges widen."""
+    narrow_below: float = setting(0.4, unit="1", low=0.0, high=1e6)
+    """Success below which the ranges narrow."""
+    step: float = setting(0.02, unit="1", low=0.0001, high=1.0)
+    """Change of the scale per iteration."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.narrow_below > self.widen_above:
+            raise ConfigError(
+                f"CurriculumConfig.narrow_below = {self.narrow_below:g}: must not exceed widen_above = "
+                f"{self.widen_above:g}"
+            )

@@ -10,22 +10,14 @@ def compute_gae(
     next_value: jax.Array,
     terminated: jax.Array,
     truncated: jax.Array,
-    *,
     discount: float,
     gae_lambda: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Advantages and value targets; all arrays are [T, B].
+    """Advantages and value targets; all arrays are [T, B]. `target = advantage + value`.
 
+    `value` is that of the observation that a step acted on, `next_value` that of the one it led to, before any restart.
     Either ending cuts the sum over later steps. A terminated step has no value after it; a truncated one
     bootstraps from the value of its true final observation.
-
-    Args:
-      value: V of the observation that step t acted on.
-      next_value: V of the observation that step t led to, before any restart.
-      terminated: bool; takes precedence over `truncated`.
-
-    Returns:
-      `(advantage, target)`, where `target = advantage + value`.
     """
     # `where`, not a product: the value of a diverged final state may be NaN.
     bootstrap = jnp.where(terminated, 0.0, next_value)

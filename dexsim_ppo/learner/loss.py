@@ -9,11 +9,13 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import Decision
-from dexsim_ppo.learner.memory import scan_memory, step_memory
-from dexsim_ppo.learner.networks import Params, apply_mlp
-from dexsim_ppo.learner.running_stats import Normalizer, normalize
+from dexsim_ppo.learner.networks import Params, apply_mlp, scan_memory, step_memory
+from dexsim_ppo.learner.running_stats import Normalizer, RunningStats, make_normalizer, normalize
+from dexsim_ppo.learner.types import Environment
 
 Metrics = dict[str, jax.Array]
+Observation = Mapping[str, jax.Array]  # by group, "actor" and "critic"
+Normalizers = Mapping[str, Normalizer]
 
 
 @pytree_dataclass
@@ -32,26 +34,24 @@ class Samples:
     first: jax.Array | None = None  # whether the step is the first of an episode, with a GRU
 
 
-def actor_mean(
-    config: PPOConfig,
-    params: Params,
-    normalizers: dict[str, Normalizer],
-    obs: dict[str, jax.Array],
-    carry: jax.Array | None = None,
-    first: jax.Array | None = None,
-) -> jax.Array:
-    """Mean of the Gaussian, `[..., A]`; `carry` and `first` as in `Samples`."""
-    x = normalize(normalizers["actor"], obs["actor"])
-    features = scan_memory(params.memory, carry, x, first, config.matmul_precision)
+def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> Normalizers:
+    """One observation normaliser per group."""
+    floor, clip = config.observation_std_floor, config.observation_clip
+    return {
+        group: make_normalizer(stats[group], layout, std_floor=floor, clip=clip)
+        for group, layout in env.observation_layout.items()
+    }
+
+
+def actor_mean(config: PPOConfig, params: Params, normalizers: Normalizers, samples: Samples) -> jax.Array:
+    """Mean of the Gaussian, `[..., A]`."""
+    x = normalize(normalizers["actor"], samples.obs["actor"])
+    features = scan_memory(params.memory, samples.carry, x, samples.first, config.matmul_precision)
     return apply_mlp(params.actor, features, config.matmul_precision)
 
 
 def actor_step(
-    config: PPOConfig,
-    params: Params,
-    normalizers: dict[str, Normalizer],
-    obs: Mapping[str, jax.Array],
-    carry: jax.Array | None,
+    config: PPOConfig, params: Params, normalizers: Normalizers, obs: Observation, carry: jax.Array | None
 ) -> tuple[jax.Array | None, jax.Array]:
     """The carry after an observation, and the mean of the Gaussian `[..., A]`."""
     x = normalize(normalizers["actor"], obs["actor"])
@@ -60,11 +60,7 @@ def actor_step(
 
 
 def critic_value(
-    config: PPOConfig,
-    params: Params,
-    normalizers: dict[str, Normalizer],
-    obs: dict[str, jax.Array],
-    carry: jax.Array | None = None,
+    config: PPOConfig, params: Params, normalizers: Normalizers, obs: Observation, carry: jax.Array | None = None
 ) -> jax.Array:
     """Normalised value, `[...]`. The critic also sees the actor's carry before this observation."""
     x = normalize(normalizers["critic"], obs["critic"])
@@ -73,11 +69,11 @@ def critic_value(
 
 
 def loss(
-    params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], batch: Samples, old_log_std: jax.Array
+    params: Params, config: PPOConfig, normalizers: Normalizers, batch: Samples, old_log_std: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """The objective [] and its metrics over one minibatch."""
     # Clipped surrogate (Schulman et al. 2017, equation 7): no gradient where the ratio has left the clip the good way.
-    mean = actor_mean(config, params, normalizers, batch.obs, batch.carry, batch.first)
+    mean = actor_mean(config, params, normalizers, batch)
     ratio = jnp.exp(distribution.log_prob(batch.decision.action, mean, params.log_std) - batch.decision.log_prob)
     clipped = jnp.clip(ratio, 1 - config.clip_ratio, 1 + config.clip_ratio)
     policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))

@@ -1,11 +1,10 @@
-"""Multilayer perceptrons of actor and critic, as plain functions on pytrees.
+"""Networks of actor and critic, multilayer perceptrons and a gated recurrent unit, as plain functions on pytrees.
 
 Matrix products name their precision: on NVIDIA GPUs JAX's default is TF32, and its 10-bit mantissa
 kept cube reorientation from being learned.
 """
 
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,26 +24,30 @@ MLP = tuple[Layer, ...]
 
 
 @pytree_dataclass
+class GRU:
+    """A gated recurrent unit of m units. The reset gate acts after the product, as in cuDNN and PyTorch."""
+
+    input: Layer  # n to 3 m: reset gate, update gate, candidate
+    recurrent: Layer  # m to 3 m
+
+
+@pytree_dataclass
 class Params:
     """All trained parameters."""
 
     actor: MLP
     log_std: jax.Array  # [A], of the Gaussian before clipping
     critic: MLP
-    memory: Any = None  # `learner.memory.GRU` of the actor, or None
+    memory: GRU | None = None  # of the actor
 
 
 def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
-    """Orthogonal kernels and zero biases for layers `sizes[0] -> sizes[1] -> ...`.
-
-    The gain is sqrt(2) in hidden layers and `output_gain` in the last one.
-    """
+    """Orthogonal kernels, of gain sqrt(2) in hidden layers, and zero biases for `sizes[0] -> sizes[1] -> ...`."""
     layers = []
     keys = jax.random.split(key, len(sizes) - 1)
-    for i, (rows, columns) in enumerate(itertools.pairwise(sizes)):
+    for i, shape in enumerate(itertools.pairwise(sizes)):
         gain = output_gain if i == len(sizes) - 2 else 2.0**0.5
-        kernel = jax.nn.initializers.orthogonal(gain)(keys[i], (rows, columns), jnp.float32)
-        layers.append(Layer(kernel=kernel, bias=jnp.zeros(columns)))
+        layers.append(Layer(jax.nn.initializers.orthogonal(gain)(keys[i], shape, jnp.float32), jnp.zeros(shape[1])))
     return tuple(layers)
 
 
@@ -65,19 +68,13 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
 
 def init_params(
     key: jax.Array,
-    *,
     actor_sizes: tuple[int, ...],
     critic_sizes: tuple[int, ...],
     initial_std: float,
-    memory: Any = None,
+    memory: GRU | None = None,
 ) -> Params:
-    """Parameters of both networks. The actor's small output gain makes the first actions nearly pure noise.
-
-    Args:
-      actor_sizes: observation size, hidden sizes, action size.
-      critic_sizes: observation size, hidden sizes, 1.
-      memory: `learner.memory.GRU` of the actor, or None; the carry's size is part of both observation sizes.
-    """
+    """Parameters of both networks, whose sizes are those of the input, of hidden layers and of the output. With memory
+    the carry's size is part of both inputs. The actor's small output gain makes the first actions nearly pure noise."""
     actor_key, critic_key = jax.random.split(key)
     return Params(
         actor=init_mlp(actor_key, actor_sizes, output_gain=0.01),
@@ -92,7 +89,66 @@ def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.A
 
     Preserves the critic's predictions when the value normaliser changes (PopArt, van Hasselt et al. 2016).
     """
-    last = layers[-1]
-    kernel = last.kernel * (std / new_std)
+    *others, last = layers
     bias = (last.bias * std + mean - new_mean) / new_std
-    return (*layers[:-1], Layer(kernel=kernel, bias=bias))
+    return (*others, Layer(last.kernel * (std / new_std), bias))
+
+
+# --- memory -------------------------------------------------------------------------------------------
+# The carry of a policy with memory is one array [..., m], zero at the start of an episode. The actor's network sees the
+# normalised observation and the carry after it: n + m numbers. A policy without memory has None for both, and sees n.
+
+
+def init_gru(key: jax.Array, size: int, units: int) -> GRU:
+    """A unit for observations [size]."""
+    keys = jax.random.split(key, 4)
+    orthogonal = jax.nn.initializers.orthogonal()
+    return GRU(
+        Layer(jax.nn.initializers.lecun_normal()(keys[0], (size, 3 * units), jnp.float32), jnp.zeros(3 * units)),
+        Layer(jnp.concatenate([orthogonal(k, (units, units), jnp.float32) for k in keys[1:]], 1), jnp.zeros(3 * units)),
+    )
+
+
+def carry_size(memory: GRU | None) -> int:
+    """Length m of the carry; 0 without memory."""
+    return 0 if memory is None else memory.recurrent.kernel.shape[0]
+
+
+def zero_carry(memory: GRU | None, batch: tuple[int, ...] = ()) -> jax.Array | None:
+    """The carry [*batch, m] at the start of an episode."""
+    return None if memory is None else jnp.zeros((*batch, carry_size(memory)))
+
+
+def step_memory(
+    memory: GRU | None, carry: jax.Array | None, x: jax.Array, precision: str = "highest"
+) -> tuple[jax.Array | None, jax.Array]:
+    """One step: the carry [..., m] after the normalised observation `x` [..., n], and what the actor's network sees
+    [..., n + m]."""
+    if memory is None or carry is None:
+        return carry, x
+    now, past = (
+        jnp.matmul(a, layer.kernel, precision=precision) + align(layer.bias, a)
+        for a, layer in ((x, memory.input), (carry, memory.recurrent))
+    )
+    (reset, update, new), (past_reset, past_update, past_new) = (jnp.split(a, 3, -1) for a in (now, past))
+    update = jax.nn.sigmoid(update + past_update)
+    new = jnp.tanh(new + jax.nn.sigmoid(reset + past_reset) * past_new)
+    carry = update * carry + (1 - update) * new
+    return carry, jnp.concatenate([x, carry], -1)
+
+
+def scan_memory(
+    memory: GRU | None, carry: jax.Array | None, x: jax.Array, first: jax.Array | None, precision: str = "highest"
+) -> jax.Array:
+    """What the actor's network saw [N, T, n + m] in rollouts of observations `x` [N, T, n]; gradients go back through
+    all T steps. It begins with the first `carry` [N, T, m], and with zero where a step is the `first` [N, T] of an
+    episode. Without memory `x` itself."""
+    if memory is None or carry is None or first is None:
+        return x
+
+    def step(carry, inputs):
+        x, first = inputs
+        return step_memory(memory, jnp.where(first[:, None], 0.0, carry), x, precision)
+
+    swap = lambda a: jnp.swapaxes(a, 0, 1)  # noqa: E731
+    return swap(jax.lax.scan(step, carry[:, 0], (swap(x), swap(first)))[1])

@@ -7,6 +7,7 @@ saving and loading that one pytree resumes training exactly.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -16,25 +17,17 @@ from jax.sharding import Mesh
 
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import layout_size
+from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.loss import Metrics, Samples
-from dexsim_ppo.learner.networks import Params, rescale_output
+from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
+from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
-from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, merge_moments, value_std
-from dexsim_ppo.learner.sharding import (
-    block_count,
-    copied,
-    in_blocks,
-    init_on_mesh,
-    moments,
-    sequences_in_blocks,
-    shardings,
-)
-from dexsim_ppo.learner.state import TrainState, init_state
-from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments, value_std
+from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
+from dexsim_ppo.learner.types import Environment, TrainState
 from dexsim_ppo.learner.update import Learner, update
 
 
@@ -56,9 +49,6 @@ def make_train(
     Args:
       env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
       mesh: devices to spread the environments over (`learner.sharding`); None for one.
-
-    Raises:
-      ConfigError: JAX is set to float64, or the environment lacks something.
     """
     check_float32()
     env = adapt(env)
@@ -69,12 +59,8 @@ def make_train(
         return strong_types(init_state(env, config, key, curriculum, mesh))
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        state, metrics = jax.lax.scan(
-            lambda s, _: train_iteration(env, config, s, curriculum, mesh),
-            state,
-            None,
-            length=config.iterations_per_call,
-        )
+        iterate = lambda s, _: train_iteration(env, config, s, curriculum, mesh)  # noqa: E731
+        state, metrics = jax.lax.scan(iterate, state, None, length=config.iterations_per_call)
         state = strong_types(state)
         if mesh is not None:
             state = jax.lax.with_sharding_constraint(state, shardings(state, mesh))
@@ -88,13 +74,43 @@ def make_train(
             lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), state, shardings(state, mesh)
         )
 
-    compiled_init = jit(init, once=True) if mesh is None else init_on_mesh(mesh, init, shapes)
+    compiled_init = jit(init, once=True) if mesh is None else functools.partial(init_on_mesh, mesh, init)
     # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
     # twice: copies separate them.
     return Training(
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
         shapes=shapes,
         step=cast(Callable, jit(step, backend=env.backend, donate_argnums=0)),
+    )
+
+
+def init_state(
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig | None, mesh: Mesh | None
+) -> TrainState:
+    """A fresh learner, and freshly reset environments [B, ...] with staggered clocks."""
+    params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
+    sizes = {group: layout_size(layout) for group, layout in env.observation_layout.items()}
+    memory = None
+    if config.memory == "gru":
+        memory = init_gru(jax.random.fold_in(params_key, 1), sizes["actor"], config.memory_size)
+    actor = (sizes["actor"] + carry_size(memory), *config.actor_layers, env.action_size)
+    critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
+    params = init_params(params_key, actor, critic, config.initial_std, memory)
+    resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
+    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
+    return TrainState(
+        params=params,
+        adam=adam.init(params),
+        learning_rate=jnp.float32(config.learning_rate),
+        observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
+        value_stats=init_stats(()),
+        env_state=batched(env.randomize_episode_time, mesh)(batched(reset, mesh)(resets), staggers),
+        key=key,
+        iteration=jnp.int32(0),
+        skipped_updates=jnp.int32(0),
+        scale=scale,
+        carry=zero_carry(memory, (config.num_envs,)),
     )
 
 
@@ -112,14 +128,8 @@ def train_iteration(
     normalizers = make_normalizers(env, config, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
     batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
-    learner, update_metrics = update(
-        config,
-        normalizers,
-        batch.samples,
-        update_key,
-        Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates),
-        mesh,
-    )
+    learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
+    learner, update_metrics = update(config, normalizers, batch.samples, update_key, learner, mesh)
     metrics |= update_metrics | {
         "bounded_rewards": bounded,
         "explained_variance": batch.explained_variance,
@@ -148,7 +158,8 @@ def train_iteration(
 
 
 def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
-    """The next scale [] of the curriculum, and the success [] of this iteration.
+    """The next scale [] of the curriculum, in [0, 1], and the success [] of this iteration. A NaN success (no episode
+    has ended) leaves the scale unchanged.
 
     Raises:
       ConfigError: the curriculum names a metric that does not exist.
@@ -159,7 +170,9 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
         success = metrics[curriculum.metric]
     else:
         raise ConfigError(f"CurriculumConfig.metric = {curriculum.metric!r}: choose from {', '.join(sorted(metrics))}")
-    return next_scale(scale, success, curriculum), success
+    narrower = jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0)
+    step = jnp.where(success >= curriculum.widen_above, curriculum.step, narrower)
+    return jnp.clip(scale + step, 0.0, 1.0), success
 
 
 # --- advantages ---------------------------------------------------------------------------------------
@@ -185,19 +198,13 @@ def prepare(
 ) -> TrainingBatch:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
+    flags = rollout.terminated, rollout.truncated
     advantage, target = compute_gae(
-        rollout.reward,
-        rollout.value,
-        rollout.next_value,
-        rollout.terminated,
-        rollout.truncated,
-        discount=config.discount,
-        gae_lambda=config.gae_lambda,
+        rollout.reward, rollout.value, rollout.next_value, *flags, config.discount, config.gae_lambda
     )
     observations = {group: rollout.obs[group] for group in observation_stats}
-    means, variances = moments(
-        {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}, mesh
-    )
+    values = {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}
+    means, variances = moments(values, mesh)
     size = advantage.size
     observation_stats = {
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
@@ -216,13 +223,11 @@ def prepare(
         carry=rollout.carry,
     )
     blocks = block_count(config, mesh)
-    if rollout.carry is None:
-        samples = in_blocks(samples, blocks)
-    else:
+    if rollout.carry is not None:
         ended = rollout.terminated | rollout.truncated
         # The carry at the rollout's first step is zero already where an episode begins with it.
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
-        samples = sequences_in_blocks(samples, blocks)
+    samples = in_blocks(samples, blocks, sequences=rollout.carry is not None)
     explained = 1 - variances["error"] / variances["target"]
     params = dataclasses.replace(params, critic=critic)
     return TrainingBatch(samples, params, value_stats, observation_stats, explained)

@@ -12,11 +12,10 @@ from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import Decision
-from dexsim_ppo.learner.loss import actor_step, critic_value
-from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, value_std
+from dexsim_ppo.learner.loss import actor_step, critic_value, make_normalizers
+from dexsim_ppo.learner.running_stats import RunningStats, value_std
 from dexsim_ppo.learner.sharding import batched
-from dexsim_ppo.learner.state import TrainState
-from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.learner.types import Environment, TrainState
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
 # bounded, not dropped: where rewards do grow, each iteration raises the bound.
@@ -95,13 +94,8 @@ def collect_rollout(
 
 def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
-    ended (NaN if none did), `episodes` their number, `repeated_starts` how many starts were used before (see
-    `scan_restarting`).
-
-    Args:
-      finite: [T, B] whether the environment's reward was.
-      step_metrics: the environment's own [T, B].
-    """
+    ended (NaN if none did), `episodes` their number. `finite` [T, B] says whether the environment's reward was, and
+    `step_metrics` [T, B] are its own."""
     done = rollout.terminated | rollout.truncated
     counted = (rollout.reward, done, rollout.terminated, ~finite)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs. One product gives
@@ -117,7 +111,6 @@ def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[s
         "episodes": ended,
         "terminated_share": terminated / ended,
         "nonfinite_rewards": nonfinite,
-        "repeated_starts": _repeated(done),
     }
     for name, of, count in (("step", sums, done.size), ("episode", ended_sums, ended)):
         metrics |= {f"{name}/{k}": v / count for k, v in zip(step_metrics, of[len(counted) :], strict=True)}
@@ -134,8 +127,7 @@ def scan_restarting(
 
     Calling `restart` after every step would compute a new episode for every environment and discard
     nearly all of them. Instead one new episode per environment is kept in reserve and renewed after at most
-    16 steps; an environment whose episode ends twice within that time starts the same episode twice
-    (`repeated_starts` counts them: none where episodes last longer).
+    16 steps; an environment whose episode ends twice within that time starts the same episode twice.
     Restarting only the rows that ended would make a GPU wait for the host at every step.
 
     Args:
@@ -147,7 +139,7 @@ def scan_restarting(
       The last states and the outputs [T, ...].
     """
     length = jax.tree.leaves(inputs)[0].shape[0]
-    block = _block(length)
+    block = max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
     restart = jax.jit(restart)
 
     def run_block(state, inputs):
@@ -167,14 +159,8 @@ def scan_restarting(
 
 
 def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax.Array]:
-    """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations.
-
-    Args:
-      returns: statistics of the returns so far [].
-
-    Returns:
-      The experience, and the number [] of rewards that were bounded.
-    """
+    """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations; also
+    the number [] of these. `returns` [] are statistics of the returns so far."""
     size = jnp.abs(rollout.reward).reshape(-1)
     others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
     spread = jnp.sqrt(jnp.mean(others**2))
@@ -182,15 +168,3 @@ def bound_rewards(rollout: Rollout, returns: RunningStats) -> tuple[Rollout, jax
     limit = jnp.where(returns.count > 0, _FAR * value_std(returns), at_first)
     bounded = jnp.sum(size > limit, dtype=jnp.float32)
     return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded
-
-
-def _block(length: int) -> int:
-    """Steps that share one reserve of new episodes."""
-    return max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
-
-
-def _repeated(done: jax.Array) -> jax.Array:
-    """Number [] of episodes in `done` [T, B] that began with a start already used."""
-    block = _block(done.shape[0])
-    ends = jnp.sum(done.reshape(-1, block, done.shape[1]), axis=1, dtype=jnp.float32)
-    return jnp.sum(jnp.maximum(ends - 1, 0.0))

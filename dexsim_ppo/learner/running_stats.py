@@ -8,8 +8,6 @@ import numpy as np
 
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import align, pytree_dataclass, static
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.types import Environment
 
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
 # cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
@@ -50,20 +48,14 @@ def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, siz
     mean = stats.mean + weight * delta
     variance = (1 - weight) * stats.variance + weight * variance + weight * (1 - weight) * delta**2
     ok = jnp.isfinite(mean) & jnp.isfinite(variance)
-    return RunningStats(
-        count=count, mean=jnp.where(ok, mean, stats.mean), variance=jnp.where(ok, variance, stats.variance)
-    )
+    return RunningStats(count, jnp.where(ok, mean, stats.mean), jnp.where(ok, variance, stats.variance))
 
 
 def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_floor: float, clip: float) -> Normalizer:
-    """Normaliser of one observation group.
+    """Normaliser of one observation group [n]; `std_floor` is in the observation's units.
 
     Entries with a fixed scale are only divided by it: with running statistics, a channel that is silent
     until first contact would see that contact as an outlier.
-
-    Args:
-      stats: of vectors [n], where n is the sum of the entries' sizes.
-      std_floor: smallest standard deviation of the other entries, in the observation's units.
     """
     scale = np.concatenate([np.full(entry.size, entry.scale or 0.0, np.float32) for entry in layout])
     std = jnp.sqrt(stats.variance + std_floor**2)
@@ -71,26 +63,13 @@ def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_f
     return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
 
 
-def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
-    """One observation normaliser per group."""
-    return {
-        group: make_normalizer(
-            stats[group], layout, std_floor=config.observation_std_floor, clip=config.observation_clip
-        )
-        for group, layout in env.observation_layout.items()
-    }
-
-
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
     """Statistics [n] from which `make_normalizer` makes this normaliser, for entries without a fixed scale.
 
     Their count is the largest, so that further samples hardly change them.
     """
-    return RunningStats(
-        count=jnp.int32(MEMORY),
-        mean=jnp.copy(normalizer.mean),
-        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0),
-    )
+    variance = jnp.maximum(normalizer.std**2 - std_floor**2, 0.0)
+    return RunningStats(jnp.int32(MEMORY), jnp.copy(normalizer.mean), variance)
 
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:

@@ -30,10 +30,7 @@ Tree = TypeVar("Tree")
 
 
 def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
-    """The devices to train on; None for one device of one process, which needs no mesh.
-
-    Args:
-      devices: how many, of all processes together; 0 for all that there are.
+    """So many devices of all processes together, 0 for all; None for one device of one process, which needs no mesh.
 
     Raises:
       ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by them.
@@ -100,19 +97,16 @@ def block_count(config: PPOConfig, mesh: Mesh | None) -> int:
     return devices if count % devices else count
 
 
-def in_blocks(tree: Tree, count: int) -> Tree:
-    """Arrays [T, B, ...] as [K, T * B / K, ...]: the rows of each block of environments."""
+def in_blocks(tree: Tree, count: int, sequences: bool) -> Tree:
+    """Arrays [T, B, ...] by blocks of environments: rows [K, T * B / K, ...] or `sequences` [K, B / K, T, ...]."""
+    if sequences:
+        return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(count, -1, len(x), *x.shape[2:]), tree)
 
-    def blocks(x: jax.Array) -> jax.Array:
+    def rows(x: jax.Array) -> jax.Array:
         x = x.reshape(x.shape[0], count, -1, *x.shape[2:]).swapaxes(0, 1)
         return x.reshape(count, -1, *x.shape[3:])
 
-    return jax.tree.map(blocks, tree)
-
-
-def sequences_in_blocks(tree: Tree, count: int) -> Tree:
-    """Arrays [T, B, ...] as [K, B / K, T, ...]: the rollouts of each block of environments."""
-    return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(count, -1, len(x), *x.shape[2:]), tree)
+    return jax.tree.map(rows, tree)
 
 
 def copied(tree: Tree, mesh: Mesh | None) -> Tree:
@@ -130,30 +124,18 @@ def shardings(state: Any, mesh: Mesh) -> Any:
     )
 
 
-def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax.Array], Any]) -> Callable:
-    """`init(key) -> TrainState`, compiled for the devices of a mesh."""
-
-    def init_sharded(key: jax.Array) -> Any:
-        compiled = jit(
-            lambda data: init(jax.random.wrap_key_data(data)),
-            once=True,
-            out_shardings=shardings(shapes(key), mesh),
-        )
-        return compiled(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
-
-    return init_sharded
+def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], key: jax.Array) -> Any:
+    """`init(key)`, a `TrainState`, compiled for the devices of a mesh."""
+    split = shardings(jax.eval_shape(init, key), mesh)
+    compiled = jit(lambda data: init(jax.random.wrap_key_data(data)), once=True, out_shardings=split)
+    return compiled(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
 
 
 def place(tree: Tree, like: Any) -> Tree:
     """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`."""
-    keys = [jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in jax.tree.leaves(tree)]
-    leaves, structure = jax.tree.flatten(tree)
-    plain = [np.asarray(jax.random.key_data(x) if key else x) for x, key in zip(leaves, keys, strict=True)]
-
-    def typed(plain: list[jax.Array]) -> Tree:
-        return jax.tree.unflatten(
-            structure,
-            [jax.random.wrap_key_data(x) if key else jnp.copy(x) for x, key in zip(plain, keys, strict=True)],
-        )
-
-    return jax.jit(typed, out_shardings=jax.tree.map(lambda x: x.sharding, like))(plain)
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    keys = jax.tree.map(is_key, tree)
+    plain = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if is_key(x) else x), tree)
+    typed = lambda x, key: jax.random.wrap_key_data(x) if key else jnp.copy(x)  # noqa: E731
+    split = jax.tree.map(lambda x: x.sharding, like)
+    return jax.jit(lambda plain: jax.tree.map(typed, plain, keys), out_shardings=split)(plain)

@@ -1,4 +1,4 @@
-"""What the learner requires of an environment."""
+"""What the learner requires of an environment, and what it carries from one iteration to the next."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -6,6 +6,10 @@ from typing import Any, Protocol
 import jax
 
 from dexsim.core.layout import LayoutEntry
+from dexsim.core.pytree import pytree_dataclass
+from dexsim_ppo.learner.adam import AdamState
+from dexsim_ppo.learner.networks import Params
+from dexsim_ppo.learner.running_stats import RunningStats
 
 
 class State(Protocol):
@@ -67,3 +71,20 @@ class Environment(Protocol):
 
     def randomize_episode_time(self, state: Any, key: jax.Array) -> Any:
         """Set the episode clock to a random time, so that a batch does not truncate all at once."""
+
+
+@pytree_dataclass
+class TrainState:
+    """All that training carries from one iteration to the next."""
+
+    params: Params
+    adam: AdamState
+    learning_rate: jax.Array  # []
+    observation_stats: dict[str, RunningStats]
+    value_stats: RunningStats  # of returns []
+    env_state: Any  # [B, ...]
+    key: jax.Array
+    iteration: jax.Array  # int32 []
+    skipped_updates: jax.Array  # int32 [], minibatches whose gradient was not finite
+    scale: jax.Array | None = None  # [] width of the randomisation ranges, with a curriculum
+    carry: jax.Array | None = None  # [B, m] of the policy's memory

@@ -11,9 +11,8 @@ from jax.sharding import Mesh
 from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.loss import Metrics, Samples, loss
+from dexsim_ppo.learner.loss import Metrics, Normalizers, Samples, loss
 from dexsim_ppo.learner.networks import Params
-from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.learner.sharding import averaged
 
 
@@ -28,7 +27,7 @@ class Learner(NamedTuple):
 
 def update(
     config: PPOConfig,
-    normalizers: dict[str, Normalizer],
+    normalizers: Normalizers,
     samples: Samples,
     key: jax.Array,
     learner: Learner,
@@ -60,18 +59,18 @@ def update(
     learner, metrics = jax.lax.scan(minibatch, learner, order)
     last_epoch = metrics["kl"][-config.minibatches :]
     metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
-    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"], iterations(config, learner))
+    iteration = learner.adam.count / (config.epochs * config.minibatches)  # skipped minibatches not counted
+    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"], iteration)
     if config.critic_first:  # A policy that does not move says nothing about the rate.
         rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
 
 
 def draw_order(key: jax.Array, times: int, rows: int) -> jax.Array:
-    """All rows in random order, int32 [times, rows].
+    """All rows in random order, int32 [times, rows], an eighth of the time of `jax.random.permutation` on a CPU.
 
-    Sorts random numbers whose low bits are the row's: one sort of plain numbers, for which a CPU takes an eighth of
-    the time of `jax.random.permutation`. Rows with equal random bits keep their order, which matters only where such a
-    group meets the edge of a minibatch.
+    Sorts random numbers whose low bits are the row's. Rows with equal random bits keep their order, which matters only
+    where such a group meets the edge of a minibatch.
     """
     width = (rows - 1).bit_length()
     number = jax.random.bits(key, (times, rows), jnp.uint32) >> width << width
@@ -114,16 +113,10 @@ def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
     return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
 
 
-def iterations(config: PPOConfig, learner: Learner) -> jax.Array:
-    """How many iterations the learner has taken, skipped minibatches not counted: float32 []."""
-    return learner.adam.count / (config.epochs * config.minibatches)
-
-
 def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array, iteration: jax.Array) -> jax.Array:
     """The next learning rate []: lower above twice the target KL, higher below half of it, within its bounds.
 
-    `kl` [] measures the whole iteration. Adapting after every minibatch would overshoot: once beyond the
-    target, each further minibatch of the iteration would lower the rate again.
+    `kl` [] measures the whole iteration: adapting after every minibatch would overshoot.
     """
     if config.kl_target == 0:
         return rate

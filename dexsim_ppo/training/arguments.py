@@ -1,19 +1,17 @@
 """Options of the training command."""
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from dexsim.core.config import Config, from_dict, setting, to_dict
+from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.policy import Policy
 
 EnvConfig = TypeVar("EnvConfig")
@@ -40,8 +38,6 @@ class TrainArguments(Config, Generic[EnvConfig]):
     """Devices to train on, which share the environments; 0 for all. In a job of several processes those of all."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
-    seeds: int = setting(1, unit="1", low=1, high=1000)
-    """Seeds to train in turn, from --seed on; --steps and --minutes are those of each."""
     backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
     """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise mjx."""
     deterministic: bool = False
@@ -88,9 +84,7 @@ class TrainArguments(Config, Generic[EnvConfig]):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.patience and not self.evaluate_every:
-            raise ConfigError(
-                f"TrainArguments.patience = {self.patience}: needs evaluations, TrainArguments.evaluate_every"
-            )
+            raise ConfigError("TrainArguments.patience needs evaluations: set TrainArguments.evaluate_every")
 
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
@@ -101,11 +95,7 @@ def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainA
 
 
 def find_hand(arguments: TrainArguments, source: Checkpoint | Policy | None) -> Hand | None:
-    """The hand to train; None for the default one.
-
-    Raises:
-      ConfigError: the run or policy to begin from is of another hand.
-    """
+    """The hand to train; None for the default one. Raises ConfigError if what the run begins from has another."""
     if source is None:
         return load_hand(arguments.hand) if arguments.hand else None
     if isinstance(source, Policy):
@@ -136,33 +126,20 @@ def training_config(arguments: TrainArguments) -> Any:
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {
     *("checkpoint_every", "devices", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "evaluation_share"),
-    *("keep_checkpoints", "log_every", "minutes", "patience", "resume", "steps", "video", "wandb"),
+    *("keep_checkpoints", "log_every", "minutes", "patience", "steps", "video", "wandb"),
     "hand",  # where its files are: their content must be the same
 }
 
 
 def check_resumed(arguments: TrainArguments, saved: TrainArguments) -> None:
-    """Check that a resumed run is still the same training.
-
-    Raises:
-      ConfigError: an option would change it; names the first.
-    """
-    for owner, name, new, old in _differences(arguments, saved):
-        if owner is not TrainArguments or name not in _RESUMABLE:
+    """Raises ConfigError: an option would make a resumed run another training; names the first."""
+    old = flat(printable(saved))
+    for path, new in flat(printable(arguments)).items():
+        if path not in _RESUMABLE and new != old[path]:
             raise ConfigError(
-                f"{owner.__name__}.{name} = {new!r}: a resumed run keeps its {old!r}; to train on with other settings, "
-                "fine-tune its policy (--policy)"
+                f"--{path.replace('_', '-')} {new}: a resumed run keeps its {old[path]}; to train on with other "
+                "settings, fine-tune its policy (--policy)"
             )
-
-
-def _differences(new: Any, old: Any) -> Iterator[tuple[type, str, Any, Any]]:
-    """Class and name of each field that differs, with both values; nested configurations field by field."""
-    for field in dataclasses.fields(new):
-        a, b = getattr(new, field.name), getattr(old, field.name)
-        if dataclasses.is_dataclass(a) and type(a) is type(b):
-            yield from _differences(a, b)
-        elif a != b:
-            yield type(new), field.name, a, b
 
 
 def printable(arguments: TrainArguments) -> dict[str, Any]:

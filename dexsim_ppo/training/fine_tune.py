@@ -8,9 +8,9 @@ import numpy as np
 
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.memory import carry_size
+from dexsim_ppo.learner.networks import carry_size
 from dexsim_ppo.learner.running_stats import recover_stats
-from dexsim_ppo.learner.state import TrainState
+from dexsim_ppo.learner.types import TrainState
 from dexsim_ppo.policy import Policy
 
 

@@ -8,12 +8,10 @@ import jax
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
-Preset = TrainArguments[Any]
-"""A preset is the command's options without those of a task."""
+Preset = TrainArguments[Any]  # without the options of a task
 
 # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data. Our tasks take
 # large steps, which become smaller; see `find_preset`.
@@ -96,11 +94,7 @@ def find_preset(name: str, task: str) -> Preset:
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
-    """The options' defaults under a preset.
-
-    Raises:
-      ConfigError: there is no such preset.
-    """
+    """The options' defaults under a preset."""
     if name != "auto" and name not in PRESETS:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     preset = find_preset(device_preset() if name == "auto" else name, task)
@@ -110,7 +104,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
 
 
 def device_preset() -> str:
-    """The name of the preset for the device found, and on a CPU for the number of cores that this process may use."""
+    """The preset for the device found, on a CPU by the number of cores that this process may use."""
     if jax.default_backend() == "gpu":
         return "gpu"
     return "cpu-large" if available_cores() >= 16 else "cpu"

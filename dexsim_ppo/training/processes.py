@@ -17,22 +17,17 @@ from jax.sharding import Mesh, NamedSharding
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.sharding import copied
-from dexsim_ppo.learner.state import TrainState
+from dexsim_ppo.learner.types import TrainState
 
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
 _JOBS = ("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX")
 _LOST_AFTER = 60  # s without a sign of life
 _REPORT = 3600  # s that the others wait for the first, which evaluates and renders
-_PATH = 4096  # bytes
 
 
 def connect() -> None:
     """Join the other processes of a Slurm, Open MPI or Kubernetes job, where this is one. Call it before any device
-    is used.
-
-    Raises:
-      DexsimError: the others cannot be reached.
-    """
+    is used."""
     if jax.distributed.is_initialized() or not any(name in os.environ for name in _JOBS):
         return
     try:
@@ -43,7 +38,7 @@ def connect() -> None:
 
 
 def is_first() -> bool:
-    """Whether this process writes the files and the display."""
+    """Whether this process writes files and prints."""
     return jax.process_index() == 0
 
 
@@ -54,12 +49,10 @@ def agree(number: int) -> int:
     return int(np.max(multihost_utils.process_allgather(np.int32(number))))
 
 
-def agree_on_path(path: Path) -> Path:
-    """The path that the first process gives. All must call it."""
-    if jax.process_count() == 1:
-        return path
-    text = np.frombuffer(os.fsencode(path).ljust(_PATH, b"\0"), np.uint8)
-    return Path(os.fsdecode(np.asarray(multihost_utils.broadcast_one_to_all(text)).tobytes().rstrip(b"\0")))
+def say(text: str) -> None:
+    """Print a line, in the first process."""
+    if is_first():
+        print(text, flush=True)
 
 
 def save(path: Path, *, tree: TrainState, **content: Any) -> None:
@@ -87,21 +80,3 @@ def exit_on_error() -> Iterator[None]:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(2)
-
-
-@contextlib.contextmanager
-def detect_lost_peer(folder: Path) -> Iterator[None]:
-    """Raise DexsimError when another process of this training has ended."""
-    if jax.process_count() == 1:
-        yield
-        return
-    lost = (
-        "another process of this training has ended; resume with: "
-        f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
-    )
-    try:
-        yield
-    except (jax.errors.JaxRuntimeError, ValueError) as error:
-        if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
-            raise
-        raise DexsimError(lost) from None

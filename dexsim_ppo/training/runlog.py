@@ -3,11 +3,11 @@
 import contextlib
 import datetime
 import fcntl
-import importlib.util
+import importlib
 import itertools
 import json
-import re
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +16,24 @@ import numpy as np
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_whole
-from dexsim.core.install import require
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.arguments import TrainArguments, printable
 
-CURVES = {
-    "episode/return": "return\nof an episode",
-    "episode/success": "success\n[share of episodes]",
-    "episode/successes": "goals\nof an episode",
-    "episode/length": "length of an\nepisode [ticks]",
-    "reward": "reward\nof a tick",
-    "step/force_error": "force error\n[N]",
-    "step/angle_error": "angle error\n[rad]",
+METRICS = {
+    "episode/return": ("return", ".2f"),
+    "episode/success": ("success", ".1%"),
+    "episode/successes": ("goals", ".1f"),
+    "episode/length": ("length [ticks]", ".0f"),
+    "reward": ("reward", ".3f"),
+    "step/force_error": ("force error [N]", ".3f"),
+    "step/angle_error": ("angle error [rad]", ".3f"),
+    "kl": ("KL", ".4f"),
+    "learning_rate": ("lr", ".1e"),
+    "action_std": ("std", ".2f"),
 }
-"""What the learning curve shows, and how it says it."""
+"""Heading and format of the metrics that are shown; those that the task does not have are left out."""
+
+_FAULTS = ("skipped_updates", "nonfinite_rewards", "bounded_rewards")  # shown where they are not zero
 
 
 class RunFolder:
@@ -49,34 +53,31 @@ class RunFolder:
 
     def existing_checkpoints(self) -> list[Path]:
         """Oldest first."""
-        return sorted(p for p in self.checkpoints.glob("*.msgpack") if re.fullmatch(r"\d{8}\.msgpack", p.name))
+        return sorted(self.checkpoints.glob("[0-9]" * 8 + ".msgpack"))
 
     def latest_checkpoint(self) -> Path:
-        """The newest checkpoint.
-
-        Raises:
-          CheckpointError: there is none.
-        """
+        """The newest checkpoint; raises CheckpointError if there is none."""
         if not (paths := self.existing_checkpoints()):
             raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
         return paths[-1]
 
-    def lock(self) -> contextlib.ExitStack:
-        """Keep other processes from training this run, until the result is closed or this process ends. Where the file
-        system or the file's mode does not allow it, nothing does.
+    def prune(self, keep: int) -> None:
+        """Delete all but the newest `keep` checkpoints, and their policies."""
+        for path in self.existing_checkpoints()[:-keep]:
+            path.unlink()
+            policy_of(path).unlink(missing_ok=True)
 
-        Raises:
-          ConfigError: another process trains it already.
-        """
+    def lock(self) -> contextlib.ExitStack:
+        """Keep other processes from training this run, until the result is closed or this process ends. Raises
+        ConfigError if another process trains it already."""
         stack = contextlib.ExitStack()
-        try:
-            # Network file systems lock a file only for those who may write to it.
-            fcntl.flock(stack.enter_context(self.config.open("rb+")), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            stack.close()
-            raise ConfigError(f"{self.path}: another process is training this run") from None
-        except OSError:
-            pass
+        with contextlib.suppress(OSError):  # Some file systems have no locks, and some lock only what one may write.
+            file = stack.enter_context(self.config.open("rb+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                stack.close()
+                raise ConfigError(f"{self.path}: another process is training this run") from None
         return stack
 
     def keep_report(self) -> None:
@@ -85,30 +86,23 @@ class RunFolder:
             self.report.rename(_free(self.path, "report-{}.json"))
 
     def set_aside(self, after: int) -> None:
-        """Rename checkpoints and the best policy of later iterations than the one that is resumed to `*.aside*`: the
-        resumed run takes another course, and would resume from or report what is not its own.
-
-        Raises:
-          CheckpointError: the best policy's file is unsound.
-        """
+        """Move checkpoints and the best policy newer than the resumed iteration to `*.aside*`: the resumed run takes
+        another course."""
         later = [path for path in self.existing_checkpoints() if int(path.stem) > after]
+        later += [policy for path in later if (policy := policy_of(path)).exists()]
         if self.best.exists() and not self.has_best(after):
             later.append(self.best)
         for path in later:
             path.rename(_free(path.parent, path.stem + ".aside{}" + path.suffix))
 
     def has_best(self, until: int) -> bool:
-        """Whether the best policy is here, and of no later iteration than `until`.
-
-        Raises:
-          CheckpointError: the file is unsound.
-        """
+        """Whether the best policy is here, and of no later iteration than `until`."""
         return self.best.exists() and load_policy(self.best).training.get("iteration", 0) <= until
 
-    def prune(self, keep: int) -> None:
-        """Delete all but the newest `keep` checkpoints."""
-        for path in self.existing_checkpoints()[:-keep]:
-            path.unlink()
+
+def policy_of(checkpoint: Path) -> Path:
+    """File of the policy of a checkpoint."""
+    return checkpoint.with_suffix(".policy.msgpack")
 
 
 def _free(folder: Path, pattern: str) -> Path:
@@ -117,43 +111,26 @@ def _free(folder: Path, pattern: str) -> Path:
     return next(path for path in paths if not path.exists())
 
 
-def new_folder(path: Path | None, task: str) -> Path:
-    """A new folder for a run, by default one that is named after its task and the time. Making it is what takes the
-    name, so that runs that begin in one second get different ones.
+def check_new(path: Path | None) -> None:
+    """Raises ConfigError: the folder given for a new run exists already."""
+    if path and path.exists():
+        raise ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
 
-    Raises:
-      ConfigError: `path` exists already.
-    """
-    stem = Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    for number in itertools.count():
-        new = path or Path(f"{stem}-{number}" if number else stem)
-        try:
-            new.mkdir(parents=True)
-            return new
-        except FileExistsError:
-            if path:
-                raise taken(path) from None
-            if not new.exists():  # It is a parent that is in the way.
-                raise
-    raise AssertionError("unreachable")
+
+def new_folder(path: Path | None, task: str) -> Path:
+    """A new folder for a run, by default one that is named after its task and the time."""
+    path = path or Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    path.mkdir(parents=True)
+    return path
 
 
 def folder_of(checkpoint: Path) -> Path:
-    """The folder of the run that a checkpoint is of.
-
-    Raises:
-      ConfigError: it is in none, or the run lacks a file that it needs at the end.
-    """
+    """The folder of the run that a checkpoint is of. Raises ConfigError if it lacks what a run needs at the end."""
     folder = RunFolder(checkpoint.resolve().parent.parent)
     for file in (folder.config, folder.untrained):
         if not file.exists():
             raise ConfigError(f"--resume {checkpoint}: {folder.path} has no {file.name}, which a run needs")
     return folder.path
-
-
-def taken(path: Path) -> ConfigError:
-    """What is wrong with the name of an existing folder."""
-    return ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
 
 
 class MetricsLog:
@@ -197,28 +174,6 @@ class MetricsLog:
                 self._wandb.finish()
 
 
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics file; a truncated last line is left out.
-
-    Raises:
-      CheckpointError: another line is no row.
-    """
-    lines, rows = path.read_text().splitlines() if path.exists() else [], []
-    for number, line in enumerate(lines, start=1):
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            if number < len(lines):
-                raise CheckpointError(f"{path}: line {number} holds no metrics; mend the file or move it") from None
-    return rows
-
-
-def means(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Mean [] of each metric over the iterations of a call that have a finite value."""
-    values = {name: np.asarray(x, np.float64) for name, x in metrics.items()}
-    return {name: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for name, x in values.items()}
-
-
 def _tensorboard_writer(path: Path) -> Any:
     for module in ("tensorboardX", "torch.utils.tensorboard"):
         with contextlib.suppress(ImportError):
@@ -227,43 +182,54 @@ def _tensorboard_writer(path: Path) -> Any:
     return None
 
 
-def check_wandb(project: str) -> None:
-    """Raises DexsimError: metrics are to go to a Weights & Biases project, and its library is not installed."""
-    if project:
-        require("wandb", "wandb", f"--wandb {project}")
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a metrics file; a truncated last line is left out."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def draw_curve(runs: Sequence[list[dict[str, Any]]], path: Path, title: str) -> None:
-    """Learning curves of runs over environment steps as a PNG; of one run also evaluations, and the elapsed time."""
+def means(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Mean [] of each metric over the iterations of a call that have a finite value."""
+    values = {name: np.asarray(x, np.float64) for name, x in metrics.items()}
+    return {name: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for name, x in values.items()}
+
+
+def progress_line(row: dict[str, Any]) -> str:
+    """What a terminal shows of one logged iteration."""
+    cells = [f"iteration {row['iteration']}", f"steps {row['env_steps']:.3g}", f"steps/s {row['env_steps_per_s']:.3g}"]
+    cells.append(f"left {row['seconds_left'] / 60:.1f} min")
+    for name, (heading, style) in METRICS.items():
+        if not math.isnan(row.get(name, math.nan)):  # no episode has ended, or the task has no such metric
+            cells.append(f"{heading} {row[name]:{style}}")
+    cells += [f"{name.replace('_', ' ')} {row[name]:.0f}" for name in _FAULTS if row.get(name)]
+    return " | ".join(cells)
+
+
+def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """The learning curve over environment steps, with the evaluations, as a PNG."""
     import matplotlib
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
-    rows = [row for run in runs for row in run]
-    own = {name for row in rows for name in row if name.startswith("step/") and name.endswith("error")} - set(CURVES)
-    words = CURVES | {name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in sorted(own)[:1]}
-    names = [name for name in words if any(row.get(name) is not None for row in rows)]
+    names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
     if not names:
         return
     figure, axes = plt.subplots(
         len(names), 1, figsize=(7, 1.9 * len(names)), sharex=True, squeeze=False, layout="constrained"
     )
 
-    def draw(ax: Any, run: list[dict[str, Any]], name: str, style: str, **options: Any) -> None:
-        points = [(1e-6 * row["env_steps"], row[name]) for row in run if row.get(name) is not None]
+    def draw(ax: Any, name: str, style: str, **options: Any) -> None:
+        points = [(1e-6 * row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
         if points:
             ax.plot(*zip(*points, strict=True), style, **options)
 
     for ax, name in zip(axes[:, 0], names, strict=True):
-        for run in runs:
-            draw(ax, run, name, "-", lw=1.2)
-        ax.set_ylabel(words[name])
+        draw(ax, name, "-", lw=1.2)
+        ax.set_ylabel(METRICS[name][0])
         ax.grid(alpha=0.3)
-    if len(runs) == 1:
-        draw(axes[0, 0], runs[0], "evaluation/return", "o", ms=4, label="evaluation")
-    minutes = rows[-1]["seconds"] / 60
-    axes[0, 0].set_title(title + (f", {minutes:.1f} min" if len(runs) == 1 else f", {len(runs)} seeds"), loc="left")
+    draw(axes[0, 0], "evaluation/return", "o", ms=4, label="evaluation")
+    axes[0, 0].set_title(f"{title}, {rows[-1]['seconds'] / 60:.1f} min", loc="left")
     axes[-1, 0].set_xlabel("environment steps [million]")
     figure.savefig(path, dpi=120)
     plt.close(figure)

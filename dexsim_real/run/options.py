@@ -20,7 +20,7 @@ class RunArguments:
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Policy file, name of a shipped policy ("grasp"), or NumPy file of `python -m dexsim_ppo.export` (.npz)."""
+    """Policy file, or name of a shipped policy ("grasp")."""
     port: str
     """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
     hand: str = ""

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv
@@ -54,12 +53,16 @@ def test_totals_are_those_of_the_series(policy):
 
 def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
     """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
-    number = lambda steps: evaluate.default_episodes(SimpleNamespace(evaluation_steps=steps))  # noqa: E731
-    assert [number(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [1024, 1024, 512, 384, 128, 64, 64]
-    chunk = lambda **options: evaluate.chunk_of(evaluate.EvaluateArguments(policy="grasp", **options))  # noqa: E731
-    assert (chunk(), chunk(episodes=3), chunk(episodes=3, chunk=2)) == (64, 3, 2)
+
+    def sizes(steps, **options):
+        arguments = evaluate.EvaluateArguments(policy="grasp", **options)
+        return evaluate.sizes(SimpleNamespace(evaluation_steps=steps), arguments)
+
+    numbers = [1024, 1024, 512, 384, 128, 64, 64]
+    assert [sizes(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [(number, 64) for number in numbers]
+    assert (sizes(290, episodes=3), sizes(290, episodes=3, chunk=2)) == ((3, 3), (3, 2))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert number(4000) == chunk() == 1024
+    assert sizes(4000) == (1024, 1024)
 
 
 @pytree_dataclass
@@ -108,18 +111,6 @@ def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_
     assert (tmp_path / "policy.msgpack").read_bytes() == before
 
 
-def test_the_tick_that_ends_an_episode_counts_and_none_after_it():
-    """Three episodes: one ends in tick 2, one in the first tick, one never. Its last metrics are those of that tick."""
-    ends = np.array([[False, True, False], [True, False, False], [True, True, False], [False, False, False]])
-    last = {"return": jnp.zeros(3)}, jnp.zeros(3, jnp.int32), jnp.zeros(3, bool)
-    for tick, ended in enumerate(ends):
-        last = evaluate._follow(last, {"return": jnp.full(3, 10.0 * (tick + 1))}, jnp.asarray(ended))
-    metrics, lived, ended = last
-    np.testing.assert_array_equal(metrics["return"], [20.0, 10.0, 40.0])
-    np.testing.assert_array_equal(lived, [1, 0, 4])
-    np.testing.assert_array_equal(ended, [True, True, False])
-
-
 def test_intervals_are_by_start():
     """Copies of an episode add nothing: four starts sixteen times each are four samples."""
     entry = mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
@@ -135,3 +126,24 @@ def test_intervals_are_by_start():
     held = np.array([False] * 8 + [True] * 2)
     report = summarize(TinyEnv(), {"return": held[None], "error": held[None]}, held[None], np.arange(10))
     assert (report["held"]["low"], report["held"]["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
+
+
+def test_episodes_end_at_their_first_termination():
+    # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {
+        "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
+        "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
+    }
+    report = summarize(TinyEnv(), metrics, terminated, np.arange(2))
+    assert report["held"]["value"] == 0.5
+    assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
+    assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
+    assert report["task"]["error"] == pytest.approx((1 + 1 + 1 + 4) / 4)
+
+
+def test_a_step_that_diverges_is_counted_although_it_ends_the_episode():
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {"return": np.zeros((3, 2)), "non_finite": np.array([[0.0, 0], [1, 0], [1, 0]])}
+    env = SimpleNamespace(summarize=lambda masked, alive: {"non_finite": masked["non_finite"].sum()})
+    assert summarize(env, metrics, terminated, np.arange(2))["task"]["non_finite"] == 1

@@ -81,7 +81,6 @@ ERRORS = {
     "number of episodes": (lambda run: evaluate_policy(run.policy, episodes=-4), "episodes = -4: must be between"),
     "two beginnings": (lambda run: train_policy(policy="grasp", resume=run.folder), "give one of them"),
     "task": (lambda run: train_policy("juggle"), "unknown task 'juggle'"),
-    "task typed": (lambda run: train_command.main(["--task", "juggle"]), "unknown task 'juggle'"),
 }
 
 

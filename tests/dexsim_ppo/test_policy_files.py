@@ -1,8 +1,5 @@
 """Files: what is written is what is read, nothing damaged is read, and a policy's file is checked when it is loaded."""
 
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,7 +119,10 @@ def test_policy_round_trip(policy, tmp_path):
     ("header", "arrays", "words"),
     [
         ({"control_rate": 1e9}, {}, "control_rate"),
+        ({"control_rate": "33"}, {}, "control_rate"),
         ({"spec": {"name": "a", "fields": [], "posture": [1e9]}}, {}, "posture"),
+        ({"observation_layout": [["a", 2, None]]}, {}, "observation"),
+        ({}, {"kernel_1": np.zeros((3, 3), np.float32)}, "invalid policy"),
         ({}, {"kernel_0": np.full((3, 8), np.nan, np.float32)}, "not finite, or deviations"),
         ({}, {"std": np.zeros(3, np.float32)}, "not finite, or deviations"),
     ],
@@ -130,7 +130,7 @@ def test_policy_round_trip(policy, tmp_path):
 def test_numbers_that_give_no_action_are_an_error(policy, tmp_path, header, arrays, words):
     path, header, arrays = tmp_path / "p.msgpack", policy.header() | header, policy.arrays() | arrays
     checkpoint.save(path, kind="policy", task="tiny", content=header, tree=arrays)
-    with pytest.raises(CheckpointError, match=words):
+    with pytest.raises(CheckpointError, match=rf"^[^\n]*p\.msgpack: [^\n]*{words}[^\n]*$"):
         load_policy(path)
 
 
@@ -145,15 +145,3 @@ def test_no_file_chooses_which_module_is_imported(policy, tmp_path, monkeypatch)
     checkpoint.save(path, kind="train", task="grasp", content={"arguments": {"task": name}}, tree={})
     with pytest.raises(DexsimError, match="must be a word"):
         train.main(["--resume", str(path)])
-
-
-def test_policies_load_without_the_simulator(policy, tmp_path):
-    policy.save(tmp_path / "p.msgpack")
-    code = (
-        f"from dexsim_ppo import load_policy; import jax.numpy as jnp, sys; "
-        f"p = load_policy({str(tmp_path / 'p.msgpack')!r}); print(p.act(None, jnp.zeros(3))[1].shape); "
-        "bad = {'mujoco', 'tyro', 'matplotlib', 'trimesh'} & set(sys.modules); "
-        "assert not bad, bad"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "(1,)", done.stderr

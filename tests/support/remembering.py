@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim_ppo.learner.memory import carry_size, init_gru
+from dexsim_ppo.learner.networks import carry_size, init_gru
 from dexsim_ppo.policy import load_policy
 
 

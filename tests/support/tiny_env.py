@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
+from dexsim_ppo.learner.adapter import Plan
 from dexsim_ppo.learner.config import PPOConfig
 
 # Learners: one that solves the task, and one that is quick to compile.
@@ -41,7 +42,7 @@ SMALL = dataclasses.replace(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TinyConfig:
+class TinyConfig(Config):
     """Settings of the integrator."""
 
     horizon: int = setting(32, unit="steps", low=2)
@@ -50,9 +51,6 @@ class TinyConfig:
     """Distance moved by a full action."""
     wall: float = setting(2.0, unit="m", low=1.5)
     """Distance from the origin at which an episode terminates."""
-
-    def __post_init__(self) -> None:
-        validate(self)
 
 
 @pytree_dataclass
@@ -65,12 +63,6 @@ class TinyState:
     truncated: jax.Array
     metrics: dict[str, jax.Array]
     key: jax.Array
-
-
-@pytree_dataclass
-class TinyPlan:
-    key: jax.Array
-    row: np.ndarray
 
 
 class TinyEnv:
@@ -133,10 +125,10 @@ class TinyEnv:
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
         return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key), state)
 
-    def evaluation_plan(self, count: int, seed: int) -> "TinyPlan":
-        return TinyPlan(jax.random.split(jax.random.key(seed), count), np.arange(count))
+    def evaluation_plan(self, count: int, seed: int) -> Plan:
+        return Plan(jax.random.split(jax.random.key(seed), count), np.arange(count))
 
-    def evaluation_starts(self, plan: "TinyPlan") -> TinyState:
+    def evaluation_starts(self, plan: Plan) -> TinyState:
         return jax.vmap(self._start)(plan.key)
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:

@@ -112,15 +112,6 @@ def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
                 np.testing.assert_allclose(moments, 0.1 * 1e-3, rtol=1e-3)
 
 
-def test_a_critic_that_learns_first_does_so_at_the_largest_rate(learner):
-    config = dataclasses.replace(UPDATES, critic_first=1)
-    after, _ = update.apply_gradients(config, learner, jax.tree.map(jnp.ones_like, learner.params))
-    moved = jax.tree.map(lambda new, old: np.asarray(old - new), after.params, learner.params)
-    for leaf in jax.tree.leaves(moved.critic):  # Adam's first step is the rate.
-        np.testing.assert_allclose(leaf, config.learning_rate_max, rtol=1e-2)
-    assert not any(np.any(leaf) for leaf in jax.tree.leaves((moved.actor, moved.log_std)))
-
-
 class Watched(TinyEnv):
     """Shows the actor the action that it got, and the critic other numbers than the actor."""
 
@@ -171,28 +162,13 @@ def experience(reward):
     return Rollout({}, None, zero, zero, reward, flag, flag)
 
 
-def test_rewards_beyond_a_hundred_deviations_of_returns_are_bounded():
-    limit = 100 * 5.0
-    reward = jnp.zeros((4, 8)).at[1, 2].set(0.9 * limit).at[2, 3].set(-3 * limit)
+def test_rewards_beyond_a_hundred_deviations_of_returns_are_bounded_and_others_stay_to_the_last_bit():
     stats = RunningStats(jnp.int32(9), jnp.float32(0), jnp.float32(25))
+    reward = jax.random.normal(jax.random.key(1), (16, 64)).at[1, 2].set(450.0).at[2, 3].set(-1500.0)
     bounded, count = bound_rewards(experience(reward), stats)
     assert float(count) == 1
-    np.testing.assert_allclose(bounded.reward[1, 2], 0.9 * limit, rtol=1e-6)
-    np.testing.assert_allclose(bounded.reward[2, 3], -limit, rtol=1e-5)
-
-
-@pytest.mark.parametrize("count", [0, 5])
-def test_healthy_rewards_stay_to_the_last_bit(count):
-    """Also constant ones, none at all, and a bonus of fifty deviations."""
-    stats = RunningStats(jnp.int32(count), jnp.float32(0.0), jnp.float32(25.0))
-    for reward in (
-        jnp.full((16, 64), 0.3),
-        jnp.zeros((16, 64)),
-        jax.random.normal(jax.random.key(1), (16, 64)).at[3, 4].set(250.0),
-    ):
-        same, counted = bound_rewards(experience(reward), stats)
-        np.testing.assert_array_equal(same.reward, reward)
-        assert float(counted) == 0
+    np.testing.assert_allclose(bounded.reward[2, 3], -500.0, rtol=1e-5)
+    np.testing.assert_array_equal(bounded.reward, reward.at[2, 3].set(bounded.reward[2, 3]))
 
 
 def test_rewards_that_grow_are_followed():

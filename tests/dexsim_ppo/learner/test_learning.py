@@ -10,7 +10,6 @@ from tiny_env import CONFIG, SMALL, TinyEnv
 
 from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo, update
-from dexsim_ppo.learner.loss import critic_value
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.learner.update import Learner
@@ -102,29 +101,6 @@ def test_a_diverging_environment_does_not_poison_the_learner():
     assert int(state.skipped_updates) == 0
     learned = (state.params, state.observation_stats, state.value_stats)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(learned))
-
-
-class TrueFinal(TinyEnv):
-    """Truncates every step, far from where the next episode starts."""
-
-    def step(self, state, action):
-        state = super().step(state, action)
-        return dataclasses.replace(
-            self._observe(dataclasses.replace(state, x=jnp.float32(7.0))), truncated=jnp.bool_(True)
-        )
-
-
-def test_next_value_is_that_of_the_true_final_observation():
-    env, config = TrueFinal(), dataclasses.replace(SMALL, observation_clip=100.0)
-    state = make_train(env, config).init(jax.random.key(0))
-    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    _, rollout, metrics = ppo.collect_rollout(env, config, state)
-    obs = rollout.obs["critic"].at[..., 0].set(7.0).at[..., 2].set(7.0)
-    # The target belongs to the episode that ended.
-    expected = critic_value(config, state.params, normalizers, {"critic": obs})
-    np.testing.assert_allclose(rollout.next_value, expected, rtol=1e-4, atol=1e-5)
-    assert float(metrics["episodes"]) == config.steps_per_iteration
-    assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"
 
 
 class Keyed(TinyEnv):

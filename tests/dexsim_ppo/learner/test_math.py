@@ -111,14 +111,6 @@ class TestAdam:
         for k in params:
             np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
 
-    def test_clip_by_global_norm(self):
-        grads = {"a": jnp.array([3.0]), "b": jnp.array([4.0])}
-        clipped, norm = adam.clip_by_global_norm(grads, 1.0)
-        assert float(norm) == pytest.approx(5)
-        np.testing.assert_allclose([clipped["a"][0], clipped["b"][0]], [0.6, 0.8], rtol=1e-6)
-        same, _ = adam.clip_by_global_norm(grads, 10.0)
-        np.testing.assert_allclose(same["a"], grads["a"])
-
 
 class TestConfig:
     def test_learning_rate_adapts_within_its_band(self):

@@ -13,8 +13,7 @@ from dexsim_ppo.evaluate import evaluate_policy
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.loss import actor_mean, critic_value
-from dexsim_ppo.learner.memory import GRU, step_memory
-from dexsim_ppo.learner.networks import Layer
+from dexsim_ppo.learner.networks import GRU, Layer, step_memory
 from dexsim_ppo.policy import Policy
 
 
@@ -40,7 +39,7 @@ def experience(kind):
         after, rollout, _ = ppo.collect_rollout(env, config, state)
         samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # the blocks, one after another
-        mean = actor_mean(config, params, normalizers, samples.obs, samples.carry, samples.first)
+        mean = actor_mean(config, params, normalizers, samples)
         value = critic_value(config, params, normalizers, samples.obs, samples.carry)
         return after, rollout, samples, mean, value
 
@@ -105,9 +104,8 @@ def test_gradients_go_back_through_the_rollout():
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def last(obs, first):
-        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.carry), first)[
-            :, -1
-        ].sum()
+        changed = dataclasses.replace(samples, obs={"actor": obs}, carry=jnp.asarray(samples.carry), first=first)
+        return actor_mean(config, state.params, normalizers, changed)[:, -1].sum()
 
     begun = jnp.zeros(samples.first.shape, bool)
     for first, reaches in ((begun, [True] * 4), (begun.at[:, 2].set(True), [False, False, True, True])):

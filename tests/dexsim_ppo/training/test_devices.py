@@ -107,7 +107,7 @@ def test_an_error_of_one_process_leaves_none_waiting(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_process_ends_the_run_with_one_line_and_it_can_be_resumed(alone, tmp_path):
+def test_a_killed_process_ends_the_run_and_it_can_be_resumed(alone, tmp_path):
     folder = RunFolder(tmp_path / "run")
     runs = start_two(*OPTIONS, "--minutes", 3, "--keep-checkpoints", 1000, "--run-dir", folder.path)
     try:
@@ -121,8 +121,6 @@ def test_a_killed_process_ends_the_run_with_one_line_and_it_can_be_resumed(alone
             run.kill()
             run.communicate()
     assert runs[0].returncode == 2, error
-    (line,) = [line for line in error.splitlines() if line.startswith("error: ")]
-    assert "another process of this training has ended; resume with: " in line and str(folder.path) in line
     for path in folder.existing_checkpoints():
         if path != folder.checkpoint(5):
             path.unlink()

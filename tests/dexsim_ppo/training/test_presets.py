@@ -16,7 +16,6 @@ from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training import presets
 from dexsim_ppo.training.arguments import training_config
-from dexsim_ppo.training.fine_tune import fine_tuning_config
 from dexsim_ppo.training.presets import PRESETS, device_preset, find_preset, preset_arguments
 
 
@@ -113,16 +112,3 @@ def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
     assert scratch.curriculum.on and not tuned.curriculum.on and not tuned.ppo.kl_halving
     env = dexsim.make("rotate", RotateConfig(pool_size=8), backend="c")
     assert scratch.curriculum.metric.removeprefix("episode/") in env.reset(jax.random.key(0)).metrics
-
-
-def test_a_policy_is_fine_tuned_with_little_noise_and_small_steps():
-    """Its own network; smaller than training from scratch in all that could make it forget."""
-    policy, scratch = load_policy("grasp"), PPOConfig(actor_layers=(7,), critic_layers=(9,), kl_target=0.015)
-    found = fine_tuning_config(policy, scratch)
-    assert found.actor_layers == tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1])
-    assert found.critic_layers == (9,)
-    assert found.initial_std <= 0.5 * scratch.initial_std and found.kl_target <= 0.1 * scratch.kl_target
-    assert found.learning_rate_min < found.learning_rate <= 0.1 * scratch.learning_rate < found.learning_rate_max
-    assert found.learning_rate_max <= scratch.learning_rate_max and found.critic_first >= 50
-    kept = ("num_envs", "rollout_length", "epochs", "minibatches", "discount", "gae_lambda", "clip_ratio")
-    assert all(getattr(found, name) == getattr(scratch, name) for name in kept)

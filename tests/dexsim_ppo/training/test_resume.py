@@ -34,23 +34,7 @@ def finished(once, tmp_path):
     return RunFolder(shutil.copytree(once.path, tmp_path / "a"))
 
 
-CHANGES = {
-    "seed": (["--seed", "9"], "--seed 9: a resumed run keeps its 3"),
-    "learner": (["--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed run keeps its 0.0005"),
-    "task": (["--env.gain", "0.5"], "--env.gain 0.5: a resumed run keeps its 0.25"),
-    "curriculum": (["--curriculum.on"], "--curriculum.on True: a resumed run keeps its False"),
-    "extremes": (["--extremes", "0.5"], "--extremes 0.5: a resumed run keeps its 0"),
-    "folder": (["--run-dir", "elsewhere"], "--run-dir"),
-}
-
-
-@pytest.mark.slow
-def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished):
-    """Nothing of the saved state follows from such an option, and the report would name it all the same."""
-    for given, said in CHANGES.values():
-        with pytest.raises(ConfigError) as refused:
-            train.main(["--resume", str(finished.path), *given])
-        assert str(refused.value).startswith(said) and "\n" not in str(refused.value)
+def test_budget_logging_and_evaluation_may_change(finished):
     same = ["--seed", "3", "--ppo.learning-rate", "5e-4"]
     looks_on = ["--steps", str(3 * PER_ITERATION), "--evaluation-episodes", "32", "--log-every", "2"]
     assert train.main(["--resume", str(finished.path), *same, *looks_on]) == 0

@@ -2,7 +2,7 @@
 
 import json
 import sys
-import types
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
@@ -10,13 +10,12 @@ from tiny_env import SMALL, TinyConfig
 
 from dexsim.core.errors import CheckpointError
 from dexsim.core.layout import LayoutEntry
-from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, PolicyParams
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
-from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, progress_line, read_metrics
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -28,14 +27,13 @@ def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
         folder.checkpoint(iteration).touch()
     (folder.checkpoints / "00000999.msgpack.tmp").touch()
     (folder.checkpoints / "mine-00000999.msgpack").touch()
-    found = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
-    assert found() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
+    policy_of(folder.checkpoint(900)).touch()
+    kept = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
+    assert kept() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
     folder.prune(9)
-    assert len(found()) == 4
-    folder.prune(3)
-    assert found() == [100, 900, 1000]
+    assert len(kept()) == 4
     folder.prune(1)
-    assert found() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
+    assert kept() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
 
 
 def policy_after(iteration):
@@ -65,51 +63,31 @@ def test_what_is_set_aside_is_never_replaced(tmp_path):
     assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
 
 
-def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path):
-    file = RunFolder(tmp_path).metrics
-    file.write_text(content := '{"iteration": 2}\n{"iterat\n{"iteration": 4}\n')
-    with pytest.raises(CheckpointError, match="metrics.jsonl: line 2 holds no metrics"):
-        MetricsLog(RunFolder(tmp_path), 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
-    assert file.read_text() == content
-
-
-class Writer:
-    """A TensorBoard writer that remembers."""
-
-    def __init__(self):
-        self.scalars, self.closed = [], False
-
-    def add_scalar(self, *scalar):
-        self.scalars.append(scalar)
-
-    def close(self):
-        self.closed = True
-
-
-def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
+def test_a_resumed_log_goes_on_after_the_checkpoint_and_to_every_sink(tmp_path, monkeypatch):
     """What came after it is repeated; a line that was cut ends the rows."""
-    writer = Writer()
+    said = []
+    writer = SimpleNamespace(add_scalar=lambda *scalar: said.append(scalar), close=lambda: said.append("closed"))
+    run = SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
     monkeypatch.setattr(runlog, "_tensorboard_writer", lambda path: writer)
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: (said.append(given), run)[1]))
     folder = RunFolder(tmp_path)
     folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4, 6, 8)) + '{"iterat')
-    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL))
+    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3))
     log.write({"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": float("nan")})
-    assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4, 6, 8], "written at once"
-    assert read_metrics(folder.metrics)[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
-    assert writer.scalars == [("kl", 0.5, 800)], "over environment steps, and no NaN"
-    log.close()
-    assert writer.closed
-
-
-def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
-    said = []
-    run = types.SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
-    fake = types.SimpleNamespace(init=lambda **given: (said.append(given), run)[1])
-    monkeypatch.setitem(sys.modules, "wandb", fake)
-    arguments = TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3)
-    log = runlog.MetricsLog(runlog.RunFolder(tmp_path), 0, arguments)
-    log.write({"iteration": 1, "env_steps": 500, "reward": 0.5, "kl": float("nan")})
+    rows = read_metrics(folder.metrics)  # written at once
+    assert [row["iteration"] for row in rows] == [2, 4, 6, 8]
+    assert rows[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
     log.close()
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
-    assert logged == [({"reward": 0.5}, 500), "finished"]
+    assert logged == [("kl", 0.5, 800), ({"kl": 0.5}, 800), "closed", "finished"], "over environment steps, and no NaN"
+
+
+def test_the_progress_line_shows_what_there_is():
+    row = {"iteration": 1180, "env_steps": 4_833_280, "env_steps_per_s": 18412.0, "seconds_left": 208.7}
+    row |= {"episode/return": 184.237, "episode/success": 0.981, "step/force_error": float("nan"), "kl": 0.00812}
+    line = progress_line(row | {"skipped_updates": 2.0, "bounded_rewards": 0.0})
+    assert line == (
+        "iteration 1180 | steps 4.83e+06 | steps/s 1.84e+04 | left 3.5 min | return 184.24 | success 98.1% | KL 0.0081 "
+        "| skipped updates 2"
+    )

@@ -1,4 +1,4 @@
-"""Evaluations during training: when they happen, which policy they choose, and when they end a training."""
+"""Evaluations during training: when they happen, which policy they choose, and when they end a training run."""
 
 import copy
 import dataclasses
@@ -20,82 +20,58 @@ ARGUMENTS = TrainArguments(
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """A run whose clock stands at 100 s, and whose evaluations return what `returns` has."""
+    """A run at 100 s; `run.evaluate(return, ...)` evaluates one policy after another, and gives the numbers of those
+    that were saved as the best."""
     monkeypatch.setattr(time, "perf_counter", lambda: 100.0)
+    run, saved = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0), []
 
-    def evaluator(params, *, episodes, seed):
-        assert (episodes, seed) == (10, trainer.SELECTION_SEED)
-        return {"return": {"value": run.returns.pop(0)}, "held": {"value": 1.0}, "task": {}, "seconds": run.takes}, None
+    def evaluate(*returns, takes=1.0):
+        for number, value in enumerate(returns):
+            report = {"return": {"value": value}, "held": {"value": 1.0}, "task": {}, "seconds": takes}
+            run.evaluator = lambda *_, report=report, **given: (report, given["seed"] == trainer.SELECTION_SEED)
+            policy = types.SimpleNamespace(params=None, save=lambda path, number=number: saved.append((number, path)))
+            monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
+            run._evaluate(None, number)
+        assert all(path == run.folder.best for _, path in saved)
+        return [number for number, _ in saved]
 
-    run = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0, evaluator=evaluator)
-    run.returns, run.takes = [], 1.0
+    run.evaluate = evaluate
     return run
 
 
-def evaluate(run, monkeypatch, *returns):
-    """Evaluate one policy after another; the iterations whose policy became the best."""
-    saved = []
-    display = types.SimpleNamespace(note=lambda _: None, working=lambda _: None)
-    for iteration, value in enumerate(returns):
-        policy = types.SimpleNamespace(params=None, save=lambda path, i=iteration: saved.append((i, path)))
-        monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
-        run.returns.append(value)
-        run._evaluate(None, iteration, display)
-    assert all(path == run.folder.best for _, path in saved)
-    return [i for i, _ in saved]
+def test_the_best_policy_is_the_one_with_the_highest_return(run):
+    assert run.evaluate(float("nan"), 3.0, float("nan"), 2.0, 4.0, 4.0) == [0, 1, 4]
+    assert run.best == {"return": 4.0, "iteration": 4}
 
 
-def test_the_best_policy_is_the_one_with_the_highest_return(run, monkeypatch):
-    assert evaluate(run, monkeypatch, 3.0, 2.0, 5.0, 5.0) == [0, 2]
-    assert run.best == {"return": 5.0, "iteration": 2}
-
-
-def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run, monkeypatch):
-    evaluate(run, monkeypatch, 3.0, 2.0, 4.0, 1.0)
+def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run):
+    run.evaluate(3.0, 2.0, 4.0, 1.0)
     assert not run._is_over(8)
-    evaluate(run, monkeypatch, 4.0)
+    run.evaluate(4.0)
     assert run._is_over(8)
     run.arguments = dataclasses.replace(ARGUMENTS, patience=0)
     assert not run._is_over(8)
 
 
-def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
-    """A tenth of 100 s: one evaluation must leave room for the one at the end."""
-    rate = 10 * 32 / 4.0  # by which an evaluation is expected to take 4 s: of the two, 8 s
-    assert run._is_evaluation_due(2, rate) and not run._is_evaluation_due(3, rate)
-    assert not run._is_evaluation_due(2, rate / 1.5)  # 12 s
-    run.takes = 60.0  # compilation
-    evaluate(run, monkeypatch, 1.0)
-    assert not run._is_evaluation_due(4, rate)  # 4 s are spent, and two more would make it 12
-    assert run._is_evaluation_due(4, 2 * rate)  # 2 s each
-    run.takes = 1.0
-    evaluate(run, monkeypatch, 1.0, 1.0)
-    assert run._is_evaluation_due(4, rate) and not run._is_evaluation_due(
-        4, rate / 2
-    )  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
-
-
-def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
-    nan = float("nan")
-    assert evaluate(run, monkeypatch, nan, 3.0, nan, 2.0, 4.0) == [0, 1, 4]
+def test_evaluations_keep_to_their_share_of_the_time(run):
+    """A tenth of 100 s: one evaluation must leave room for the one at the end. The first one's time is compilation."""
+    assert run._is_evaluation_due(2) and not run._is_evaluation_due(3)
+    run.evaluate(1.0, takes=60.0)
+    assert run._is_evaluation_due(4)
+    run.evaluate(1.0, takes=3.0)
+    assert run._is_evaluation_due(6), "3 s, and two more"
+    run.evaluate(1.0, takes=3.0)
+    assert not run._is_evaluation_due(8), "6 s, and two more"
 
 
 @pytest.mark.parametrize("own", [False, True])
 def test_an_evaluation_is_of_the_task_as_configured(own, tmp_path, monkeypatch):
     """Not of training's corners."""
-    import dexsim
-
-    made = []
-    monkeypatch.setattr(dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv(), raising=False)
-    env = TinyEnv()
+    made, env = [], TinyEnv()
     env.backend, env.hand = "c", "the hand"
-    arguments = dataclasses.replace(ARGUMENTS, evaluation_chunk=6)
+    monkeypatch.setattr(trainer.dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv())
     if own:
         monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
-    run = Run(env, arguments, RunFolder(tmp_path), 0.0)
-    if own:
-        options = {"backend": "c", "hand": "the hand"}
-        assert made == [(("tiny", arguments.env), options)] and run.evaluator.env is not env
-    else:
-        assert not made and run.evaluator.env is env
-    assert run.evaluator.chunk == 6
+    run = Run(env, ARGUMENTS, RunFolder(tmp_path), 0.0)
+    assert made == ([(("tiny", ARGUMENTS.env), {"backend": "c", "hand": "the hand"})] if own else [])
+    assert (run.evaluator.env is env) != own and run.evaluator.chunk == 10

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -21,8 +20,8 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import print_report, summarize
-from dexsim_ppo.training.runlog import RunFolder, read_metrics
+from dexsim_ppo.report import print_report
+from dexsim_ppo.training.runlog import RunFolder, policy_of, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
 
 QUICK = [*tiny_train.QUICK, *"--evaluate-every 4 --evaluation-share 1 --log-every 2 --checkpoint-every 3".split()]
@@ -47,6 +46,7 @@ def test_a_run_leaves_its_files(finished):
     assert rows[-1]["env_steps"] == 6 * PER_ITERATION and rows[-1]["seconds"] > rows[0]["seconds"] > 0
     assert [row.get("evaluation/return") is not None for row in rows] == [False, False, True, False]
     assert [path.name for path in finished.existing_checkpoints()] == ["00000003.msgpack", "00000006.msgpack"]
+    assert [load_policy(policy_of(path)).training["iteration"] for path in finished.existing_checkpoints()] == [3, 6]
     config = json.loads(finished.config.read_text())
     assert config["arguments"]["ppo"]["num_envs"] == 16 and config["arguments"]["env"]["gain"] == 0.25
     report = json.loads(finished.report.read_text())
@@ -54,9 +54,7 @@ def test_a_run_leaves_its_files(finished):
         held = report[name]["held"]
         assert held["low"] <= held["value"] <= held["high"]
         assert report[name]["episodes"] == 16 and report[name]["seed"] == 0
-    clock = report["timing"]  # the rate is that of the five calls after the first, in which programs may load
-    assert 0 < clock["first_call_s"] < clock["step_s"] <= clock["training_s"]
-    assert clock["env_steps_per_s"] == pytest.approx(5 * PER_ITERATION / (clock["step_s"] - clock["first_call_s"]))
+    assert report["timing"]["env_steps_per_s"] > 5 * PER_ITERATION / report["timing"]["training_s"]
     assert report["hardware"]["cpu_cores"] and report["versions"]["jax"] and "dexsim_ppo.train" in report["command"]
     policy, rows = load_policy(finished.best, task="tiny"), [row for row in rows if row.get("evaluation/return")]
     measured, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
@@ -100,27 +98,6 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path):
         assert getattr(tuned.ppo, name) == getattr(plain.ppo, name), name
 
 
-def test_episodes_end_at_their_first_termination():
-    # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
-    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
-    metrics = {
-        "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
-        "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
-    }
-    report = summarize(TinyEnv(), metrics, terminated, np.arange(2))
-    assert report["held"]["value"] == 0.5
-    assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
-    assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
-    assert report["task"]["error"] == pytest.approx((1 + 1 + 1 + 4) / 4)
-
-
-def test_a_step_that_diverges_is_counted_although_it_ends_the_episode():
-    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
-    metrics = {"return": np.zeros((3, 2)), "non_finite": np.array([[0.0, 0], [1, 0], [1, 0]])}
-    env = SimpleNamespace(summarize=lambda masked, alive: {"non_finite": masked["non_finite"].sum()})
-    assert summarize(env, metrics, terminated, np.arange(2))["task"]["non_finite"] == 1
-
-
 def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
     """It stays where it starts: with rewards of 1 - |x - target| over 32 steps the return follows from the starts."""
     env = TinyEnv()
@@ -149,6 +126,9 @@ TRAIN_ERRORS = {
     "another task's options": (["--task", "grasp", "--config", "RUN"], "of the task 'tiny', not 'grasp'"),
     "no configuration": (["--config", "none.json"], "no configuration of a run"),
     "two beginnings": (["--config", "RUN", "--resume", "RUN"], "leave --resume"),
+    "another seed": (["--resume", "RUN", "--seed", "9"], "--seed 9: a resumed run keeps its 0"),
+    "another learner": (["--resume", "RUN", "--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed"),
+    "another folder": (["--resume", "RUN", "--run-dir", "x"], "--run-dir x: a resumed run stays"),
 }
 EVALUATE_ERRORS = {
     "cut short": (["broken.msgpack"], "cut short"),
@@ -200,35 +180,14 @@ def test_a_command_line_without_a_task_says_what_there_is(capsys):
 
 
 def test_a_signal_saves_and_says_how_to_go_on(tmp_path):
-    number = signal.SIGTERM
     command = [sys.executable, tiny_train.__file__, *QUICK, "--minutes", "5", "--run-dir", str(tmp_path / "a")]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path.strip(os.pathsep)}
-    )
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})
     metrics, deadline = tmp_path / "a" / "metrics.jsonl", time.time() + 600
     while time.time() < deadline and not (metrics.exists() and metrics.stat().st_size):
         time.sleep(0.1)
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=600)
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + signal.SIGTERM
     assert f"--resume {tmp_path / 'a'}" in out.splitlines()[-1]
     assert RunFolder(tmp_path / "a").latest_checkpoint().exists()
-
-
-def test_seeds_are_trained_in_turn_and_reported_together(tmp_path):
-    path = tmp_path / "seeds"
-    options = ["--seeds", "2", "--seed", "5", "--steps", str(2 * PER_ITERATION), "--run-dir", str(path)]
-    assert train.main([*QUICK, *options]) == 0
-    report = json.loads((path / "report.json").read_text())
-    each = [json.loads((path / f"seed-{seed}" / "report.json").read_text()) for seed in (5, 6)]
-    assert report["seeds"] == [5, 6] and [one["seed"] for one in each] == [5, 6]
-    values = [one["trained"]["return"]["value"] for one in each]
-    assert report["trained"]["return"]["values"] == values and values[0] != values[1]
-    assert report["trained"]["return"]["mean"] == pytest.approx(np.mean(values))
-    assert report["trained"]["return"]["std"] == pytest.approx(np.std(values, ddof=1))
-    assert (path / "curve.png").exists()
-    alone = tmp_path / "alone"
-    assert train.main([*QUICK, "--seed", "6", "--steps", str(2 * PER_ITERATION), "--run-dir", str(alone)]) == 0
-    first, second = (load_policy(RunFolder(p).last).params for p in (alone, path / "seed-6"))
-    jax.tree.map(np.testing.assert_array_equal, first, second)
