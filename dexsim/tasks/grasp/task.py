@@ -101,10 +101,6 @@ class Grasp(Task):
         if not hand.grasp_centre or not (config.posture or hand.grasp_posture):
             raise ConfigError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
         config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture)
-        if len(config.posture) != hand.num_joints:
-            raise ConfigError(
-                f"GraspConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
-            )
         x, y, z = hand.grasp_centre
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, config.finger_force

@@ -119,10 +119,6 @@ class Rotate(Task):
         if not (posture and reference):
             raise ConfigError(f"hand {hand.name!r} has no rotate: its TOML needs [rotate] with posture and reference")
         config = dataclasses.replace(config, posture=posture, reference=reference)
-        if len(config.posture) != hand.num_joints:
-            raise ConfigError(
-                f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
-            )
         self.config, self.hand, self.posture, self.turn = config, hand, posture, config.turn
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
