@@ -95,7 +95,7 @@ class Motions:
         self.template = build_scene(self.env.hand, rules.slots, rules.largest, physics, rules.gravity, "c").model
         self.template.opt.iterations = 50
         pool, index = self.env.pool, np.asarray(self.env.pool.object.shape_index)
-        names = {shape: getattr(config, "object", "") or self.env.task.shape_names[shape] for shape in np.unique(index)}
+        names = {shape: rules.shape_names[shape] for shape in np.unique(index)}
         self.cases, begins = list[tuple[str, str]](), list[Begin]()
         for motion in MOTIONS:
             for shape in names:

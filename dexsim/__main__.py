@@ -29,14 +29,6 @@ COMMANDS = {
 """Module and purpose of each command."""
 
 
-def usage() -> str:
-    """The page of `dexsim --help`."""
-    lines = [f"  {name:20} {purpose}" for name, (_, purpose) in COMMANDS.items()]
-    return "\n".join(
-        ["usage: dexsim COMMAND [options]", "", *lines, "", "dexsim COMMAND --help shows the command's options."]
-    )
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command. Returns its exit code.
 
@@ -45,7 +37,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
-        print(usage())
+        print("usage: dexsim COMMAND [options]\n")
+        for command, (_, purpose) in COMMANDS.items():
+            print(f"  {command:20} {purpose}")
+        print("\ndexsim COMMAND --help shows the command's options.")
         return 0
     name, *rest = argv
     if name not in COMMANDS:

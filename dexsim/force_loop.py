@@ -17,6 +17,7 @@ Array = TypeVar("Array", jax.Array, np.ndarray)
 
 # Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
 _LOW, _HIGH = 0.0, 1.5
+_SLEW = 1.0  # 1/s, largest rate of the correction
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,8 +28,6 @@ class ForceLoop(Config):
     """Rate at which the command is corrected, per error; 0 turns the loop off."""
     limit: float = setting(0.6, unit="1", low=0.0, high=2.0)
     """Largest correction of the command."""
-    slew: float = setting(1.0, unit="1/s", low=0.001, high=100.0)
-    """Largest rate of the correction."""
 
 
 def target_force(command: Array, span: tuple[float, float]) -> Array:
@@ -70,7 +69,7 @@ def correct_command(
     touching = force > 0
     measured = commanded_force(force, touching)
     error = command - (measured - span[0]) / (span[1] - span[0])
-    change = jnp.clip(loop.gain * error, -loop.slew, loop.slew) * period
+    change = jnp.clip(loop.gain * error, -_SLEW, _SLEW) * period
     moved = jnp.where(jnp.sum(touching[1:]) >= 2, correction + change, correction)
     # No windup: the sum stays in what a policy is shown.
     return jnp.clip(moved, jnp.maximum(-loop.limit, _LOW - command), jnp.minimum(loop.limit, _HIGH - command))

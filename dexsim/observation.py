@@ -38,8 +38,8 @@ class Readings:
     goal_quat: jax.Array  # [4] target orientation of the object
     command: jax.Array  # [] grip command in [0, 1]
     last_action: jax.Array  # [J] in [-1, 1]
-    past_actions: jax.Array | None = None  # [2, J], the two before `last_action`, newest first
-    palm_gravity: jax.Array | None = None  # [3] unit vector; measured while the object lies flat, before the episode
+    past_actions: Any = None  # [2, J], the two before `last_action`, newest first
+    palm_gravity: Any = None  # [3] unit vector; measured while the object lies flat, before the episode
 
 
 @pytree_dataclass
@@ -93,12 +93,7 @@ def _relative_orientation(f: Features) -> jax.Array:
     return _encode(relative, f.encoding)
 
 
-def _given(reading: jax.Array | None) -> jax.Array:
-    assert reading is not None, "`Readings` without this reading"
-    return reading
-
-
-def _per_joint(hand: Hand, encoding: str) -> int:
+def _joints(hand: Hand, encoding: str) -> int:
     return hand.num_joints
 
 
@@ -110,41 +105,31 @@ def _fixed(count: int) -> Callable[[Hand, str], int]:
     return lambda hand, encoding: count
 
 
-def _angles(hand: Hand, encoding: str) -> int:
+def _orientation(hand: Hand, encoding: str) -> int:
     return 4 if encoding == "quaternion" else 6
 
 
-FIELDS: dict[str, ObservationField] = {
-    field.name: field
-    for field in (
-        ObservationField("joint_position", _per_joint, "hand", lambda f: f.readings.joint_position),
-        ObservationField("joint_torque", _per_joint, "hand", lambda f: f.readings.joint_torque, scale=0.3),
-        ObservationField("object_position", _fixed(3), "camera", lambda f: f.readings.object_position),
-        ObservationField("object_velocity", _fixed(3), "camera", lambda f: f.readings.object_velocity),
-        ObservationField("contact_force", _per_finger(1), "hand", lambda f: f.contact_force, scale=5.0),
-        ObservationField("contact_centre", _per_finger(3), "hand", lambda f: f.contact_centre.ravel(), scale=0.1),
-        ObservationField("finger_force", _per_finger(1), "hand", lambda f: f.finger_force(), scale=5.0),
-        ObservationField("fingertip_position", _per_finger(3), "hand", lambda f: f.pose.tip_position.ravel()),
-        ObservationField(
-            "fingertip_rotation", _per_finger(6), "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel()
-        ),
-        ObservationField("command", _fixed(1), "user", lambda f: f.readings.command[None], scale=0.5),
-        ObservationField("last_action", _per_joint, "policy", lambda f: f.readings.last_action, scale=1.0),
-        ObservationField(
-            "past_actions",
-            lambda hand, encoding: 2 * hand.num_joints,
-            "policy",
-            lambda f: _given(f.readings.past_actions).ravel(),
-            scale=1.0,
-        ),
-        ObservationField("palm_gravity", _fixed(3), "imu", lambda f: _given(f.readings.palm_gravity), scale=1.0),
-        ObservationField("relative_orientation", _angles, "imu", _relative_orientation),
-        ObservationField("object_orientation", _angles, "imu", lambda f: _encode(f.readings.object_quat, f.encoding)),
-        ObservationField("fingertip_velocity", _per_finger(6), "simulator", lambda f: f.twist().ravel()),
-        ObservationField("joint_velocity", _per_joint, "simulator", lambda f: f.motion.joint_velocity),
-        ObservationField("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin),
-    )
-}
+_FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], jax.Array], float | None], ...] = (
+    ("joint_position", _joints, "hand", lambda f: f.readings.joint_position, None),
+    ("joint_torque", _joints, "hand", lambda f: f.readings.joint_torque, 0.3),
+    ("object_position", _fixed(3), "camera", lambda f: f.readings.object_position, None),
+    ("object_velocity", _fixed(3), "camera", lambda f: f.readings.object_velocity, None),
+    ("contact_force", _per_finger(1), "hand", lambda f: f.contact_force, 5.0),
+    ("contact_centre", _per_finger(3), "hand", lambda f: f.contact_centre.ravel(), 0.1),
+    ("finger_force", _per_finger(1), "hand", lambda f: f.finger_force(), 5.0),
+    ("fingertip_position", _per_finger(3), "hand", lambda f: f.pose.tip_position.ravel(), None),
+    ("fingertip_rotation", _per_finger(6), "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(), None),
+    ("command", _fixed(1), "user", lambda f: f.readings.command[None], 0.5),
+    ("last_action", _joints, "policy", lambda f: f.readings.last_action, 1.0),
+    ("past_actions", lambda hand, _: 2 * hand.num_joints, "policy", lambda f: f.readings.past_actions.ravel(), 1.0),
+    ("palm_gravity", _fixed(3), "imu", lambda f: f.readings.palm_gravity, 1.0),
+    ("relative_orientation", _orientation, "imu", _relative_orientation, None),
+    ("object_orientation", _orientation, "imu", lambda f: _encode(f.readings.object_quat, f.encoding), None),
+    ("fingertip_velocity", _per_finger(6), "simulator", lambda f: f.twist().ravel(), None),
+    ("joint_velocity", _joints, "simulator", lambda f: f.motion.joint_velocity, None),
+    ("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin, None),
+)
+FIELDS: dict[str, ObservationField] = {row[0]: ObservationField(*row) for row in _FIELDS}
 """Every field by name. A field of one's own is one more entry."""
 
 
@@ -160,8 +145,6 @@ class ObservationConfig(Config):
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=FIELDS)
     """Measured fields beyond the task's own, for actor and critic."""
-    add_critic: tuple[str, ...] = setting((), choices=FIELDS)
-    """Fields that only the critic gets on top; those that only a simulator knows, too."""
     force: ForceEstimate = setting(ForceEstimate())
     """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
 
@@ -213,10 +196,10 @@ def group_configs(config: ObservationConfig) -> tuple[ObservationConfig, Observa
     Raises:
       ConfigError: the actor is to see what nothing measures.
     """
-    true = [name for name in config.add if FIELDS[name].source == "simulator"]
-    if true:
-        raise ConfigError(f"ObservationConfig.add = {true[0]!r}: no sensor measures it; name it in add_critic")
-    return config, dataclasses.replace(config, leave_out=(), add=(*config.add, *config.add_critic), add_critic=())
+    for name in config.add:
+        if FIELDS[name].source == "simulator":
+            raise ConfigError(f"ObservationConfig.add = {name!r}: no sensor measures it")
+    return config, dataclasses.replace(config, leave_out=())
 
 
 def observe(
@@ -232,8 +215,7 @@ def observe(
     Args:
       hand: the hand's description (static).
       readings: one tick of measurements.
-      names: the task's fields: `GRASP` (66 values for the shipped hand), `ROTATE` (65) or
-        `ROTATE_CRITIC` (149).
+      names: the task's fields, such as `GRASP` (66 values for the shipped hand) or `ROTATE` (65).
       config: what to leave out and how to encode.
       motion: for a critic whose fields ask for it.
       pose: of the hand at the readings' joint angles, where it is known already.

@@ -25,43 +25,21 @@ NOMINAL = {
     "speed_factor": 1.0,
     "efficiency": 1.0,
     "latency": 0.0,
-    "latency_spread": 0.0,
-    "ripple": 0.0,
-    "coulomb_friction": 0.0,
-    "viscous_friction": 0.0,
     "sensing_latency": 0.0,
     "encoder_bias": 0.0,
     "torque_gain": 1.0,
     "taxel_gain": 1.0,
     "gravity_tilt": 0.0,
+    "latency_spread": 0.0,
+    "ripple": 0.0,
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
     "pad_thickness_delta": 0.0,
 }
 """The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
-_SPANS = (*(name for name in NOMINAL if name not in _DEVIATIONS), "ripple_count")
-_KEYS = (
-    "stiffness_factor",
-    "damping_factor",
-    "dead_band",
-    "torque_factor",
-    "speed_factor",
-    "efficiency",
-    "latency",
-    "sensing_latency",
-    "encoder_bias",
-    "torque_gain",
-    "taxel_gain",
-    "gravity_tilt",
-    "latency_spread",
-    "ripple",
-    "ripple_count",
-    "ripple_phase",
-    "coulomb_friction",
-    "viscous_friction",
-    "",  # free: without it the next one would be drawn by another key
-    "pad_thickness_delta",
-)
-"""Which of an episode's keys draws what."""
+# Which of an episode's 20 keys draws which of these; the ripples' number and phase have two more.
+_KEYS, _RIPPLE_COUNT, _RIPPLE_PHASE = np.array([*range(14), 16, 17, 19]), 14, 15
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,25 +101,19 @@ class Randomization(Config):
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, *_SPANS)
+        check_ranges(self, "ripple_count", *(name for name in NOMINAL if name not in _DEVIATIONS))
         if self.beyond and not self.extremes:
             raise ConfigError(
-                f"Randomization.beyond = {self.beyond:g} with extremes = 0: only hands at an extreme have "
-                "values beyond their ranges; set extremes, too"
+                f"Randomization.beyond = {self.beyond:g} needs extremes above 0: only hands at an extreme lie beyond"
             )
         width = self.scale * (1 + self.beyond)
+        where = f"at scale {self.scale:g} and beyond {self.beyond:g}"
         if self.gravity_tilt * width > 1.5:  # At a right angle gravity would turn over.
-            raise ConfigError(
-                f"Randomization.gravity_tilt = {self.gravity_tilt:g} rad at scale {self.scale:g} and beyond "
-                f"{self.beyond:g} reaches {self.gravity_tilt * width:.3g} rad: must stay below 1.5 rad"
-            )
+            raise ConfigError(f"Randomization.gravity_tilt = {self.gravity_tilt:g} rad {where}: reaches 1.5 rad")
         for name in (name for name, nominal in NOMINAL.items() if nominal):  # factors
             low, high = getattr(self, name)
-            if min(1 + width * (low - 1), 1 + width * (high - 1)) < 0:
-                raise ConfigError(
-                    f"Randomization.{name} = ({low:g}, {high:g}) at scale {self.scale:g} and beyond "
-                    f"{self.beyond:g} reaches below 0: narrow one or the other"
-                )
+            if 1 + width * (low - 1) < 0:
+                raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) {where}: reaches below 0")
 
 
 @pytree_dataclass
@@ -182,11 +154,8 @@ def sample_hand(
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """
     drawn = _draw(key, config, hand, config.scale * scale)
-    values = {name: row[: hand.num_joints] for name, row in drawn.items()}
-    joints = (hand.num_joints,)
-    count_key, phase_key = jax.random.split(key, len(_KEYS))[_KEYS.index("ripple_count") :][:2]
-    low, high = config.ripple_count
-    limit = jnp.asarray(hand.torque_limit)
+    values, joints = {name: row[: hand.num_joints] for name, row in drawn.items()}, (hand.num_joints,)
+    keys, limit, (low, high) = jax.random.split(key, 20), jnp.asarray(hand.torque_limit), config.ripple_count
     actuator = Actuator(
         stiffness=config.stiffness * values["stiffness_factor"],
         damping=config.damping * values["damping_factor"],
@@ -195,8 +164,8 @@ def sample_hand(
         no_load_speed=jnp.asarray(hand.speed_limit) * values["speed_factor"],
         efficiency=values["efficiency"],
         ripple=values["ripple"],
-        ripple_count=jax.random.uniform(count_key, joints, minval=low, maxval=high),
-        ripple_phase=jax.random.uniform(phase_key, joints, maxval=2 * jnp.pi),
+        ripple_count=jax.random.uniform(keys[_RIPPLE_COUNT], joints, minval=low, maxval=high),
+        ripple_phase=jax.random.uniform(keys[_RIPPLE_PHASE], joints, maxval=2 * jnp.pi),
         encoder_bias=values["encoder_bias"],
         coulomb_friction=limit * values["coulomb_friction"],
         viscous_friction=values["viscous_friction"],
@@ -216,12 +185,9 @@ def sample_hand(
 def _draw(key: jax.Array, config: Randomization, hand: Hand, width: jax.Array | float) -> dict[str, jax.Array]:
     """A row of values for every name of `NOMINAL`: as many as the hand has joints or fingers, and two at least."""
     shape, nominal = (max(hand.num_joints, hand.num_fingers, 2),), np.array(list(NOMINAL.values()), np.float32)
-    if isinstance(width, (int, float)) and width == 0:  # known beforehand: nothing is drawn
-        return {name: jnp.full(shape, value, float) for name, value in NOMINAL.items()}
     spans = [getattr(config, name) for name in NOMINAL]
     spans = [(-span, span) if name in _DEVIATIONS else span for name, span in zip(NOMINAL, spans, strict=True)]
-    keys = jax.random.split(key, len(_KEYS))[np.array([_KEYS.index(name) for name in NOMINAL])]
-    extreme = sample_extreme(key, config.extremes)
+    keys, extreme = jax.random.split(key, 20)[_KEYS], sample_extreme(key, config.extremes)
     drawn = uniforms(keys, spans, extreme, shape, nominal=list(NOMINAL.values()), beyond=config.beyond)
     rows = nominal[:, None] + width * (drawn - nominal[:, None])
     return dict(zip(NOMINAL, rows, strict=True))

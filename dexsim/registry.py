@@ -11,7 +11,6 @@ import inspect
 import os
 import typing
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, cast
 
 import jax
@@ -28,9 +27,6 @@ from dexsim.tasks.grasp import config as grasp
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate import config as rotate
 from dexsim.tasks.rotate.task import Rotate
-
-PLUGINS = "dexsim.tasks"
-"""Entry-point group in which an installed package names the modules that register its tasks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,16 +71,21 @@ def register(
     Raises:
       ConfigError: the name is taken or no word, or no configuration class can be found.
     """
+    where = f"register({name!r}, ...)"
     if not name.isidentifier():
-        raise ConfigError(f"register({name!r}, ...): the name must be a word, such as 'poke'")
-    make_config = _annotated_config(name, factory) if config is None else config
-    default = make_config()
+        raise ConfigError(f"{where}: the name must be a word, such as 'poke'")
+    if config is None:
+        hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
+        config = hints.get(next(iter(inspect.signature(factory).parameters)))
+        if not (inspect.isclass(config) and issubclass(config, EnvConfig)):
+            raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig, or give config=")
+    default = config()
     if not isinstance(default, EnvConfig):
-        raise ConfigError(f"register({name!r}, ...): the configuration is a {type(default).__name__}, not an EnvConfig")
+        raise ConfigError(f"{where}: the configuration is a {type(default).__name__}, not an EnvConfig")
     taken = TASKS.get(name)
     if taken is not None and getattr(taken.task, "__qualname__", None) != getattr(factory, "__qualname__", ""):
-        raise ConfigError(f"register({name!r}, ...): there is a task of that name already")
-    TASKS[name] = TaskEntry(type(default), factory, make_config)
+        raise ConfigError(f"{where}: there is a task of that name already")
+    TASKS[name] = TaskEntry(type(default), factory, config)
 
 
 def find_task(name: str) -> TaskEntry:
@@ -98,14 +99,17 @@ def find_task(name: str) -> TaskEntry:
     if module:
         if word in _OURS:
             raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
-        makes = getattr(_import(module), word, None)
+        try:
+            makes = getattr(importlib.import_module(module), word, None)
+        except ImportError as error:
+            raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
         # Many modules may have a `make_env`: the one that is named makes it.
         if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
-        if word in TASKS and word not in _OURS:
+        if word in TASKS:
             _MODULES[word] = module
     if word not in TASKS:
-        for plugin in importlib.metadata.entry_points(group=PLUGINS):
+        for plugin in importlib.metadata.entry_points(group="dexsim.tasks"):
             plugin.load()
     if word not in TASKS:
         lacks = f"{module} neither registers it nor has a function of that name"
@@ -115,8 +119,7 @@ def find_task(name: str) -> TaskEntry:
 
 
 def task_option(name: str) -> str:
-    """What a command needs to find this task: its `--task` with a space before it where a module was given to this
-    program, else nothing."""
+    """ " --task my_module:name" of a task whose module was given to this program, else nothing."""
     return f" --task {_MODULES[name]}:{name}" if name in _MODULES else ""
 
 
@@ -128,8 +131,7 @@ def make(
     hand: Hand | None = None,
     seed: int = 0,
 ) -> Env:
-    """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is
-    set.
+    """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is set.
 
     Args:
       task: a name in `TASKS`, registered ones included.
@@ -147,7 +149,14 @@ def make(
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
             raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")
-        return _make_other(task, makes)
+        try:
+            inspect.signature(makes).bind()
+        except TypeError:
+            raise ConfigError(f"--task {task}: must be callable without arguments") from None
+        env = makes()
+        if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
+            raise ConfigError(f"--task {task} returned a {type(env).__name__}; expected reset() and step()")
+        return env
     hand = load_hand() if hand is None else hand
     return Env(make_task(task, hand, config), hand, backend=backend, seed=seed)
 
@@ -168,31 +177,5 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     return task
 
 
-def _annotated_config(name: str, factory: Callable) -> type[EnvConfig]:
-    hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
-    annotated = hints.get(next(iter(inspect.signature(factory).parameters)))
-    if not (inspect.isclass(annotated) and issubclass(annotated, EnvConfig)):
-        raise ConfigError(
-            f"register({name!r}, ...): annotate the factory's first parameter with its EnvConfig, or give config="
-        )
-    return annotated
-
-
-def _make_other(task: str, makes: Callable[[], Any]) -> Any:
-    if any(p.default is p.empty and p.kind is not p.VAR_KEYWORD for p in inspect.signature(makes).parameters.values()):
-        raise ConfigError(f"--task {task}: must be callable without arguments")
-    env = makes()
-    if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
-        raise ConfigError(f"--task {task} returned a {type(env).__name__}; expected reset() and step()")
-    return env
-
-
 def _no_task(config: Any, hand: Hand) -> Task:
     raise ConfigError("not available for an environment from elsewhere: it can be trained and evaluated")
-
-
-def _import(module: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None

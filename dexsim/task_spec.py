@@ -5,7 +5,6 @@ of any task runs on a computer that has neither MJX nor the task's code.
 """
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -93,8 +92,8 @@ class TaskSpec(Config):
         return cls(
             name=task.name,
             fields=tuple(task.fields["actor"]),
-            gravity=_triple(task.gravity),
-            reference=_triple(task.reference),
+            gravity=task.gravity,
+            reference=task.reference,
             posture=tuple(map(float, task.posture)),
             control=config.control,
             observation=config.observation,
@@ -127,8 +126,3 @@ def correct_readings(
     before = jnp.zeros(()) if correction is None else correction
     after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
     return dataclasses.replace(readings, command=readings.command + after), after
-
-
-def _triple(values: Iterable[float]) -> tuple[float, float, float]:
-    x, y, z = map(float, values)
-    return x, y, z

@@ -36,5 +36,3 @@ class EnvConfig(Config):
     touch_method: str = setting("closed_form", choices=TOUCH_METHODS)
     """How far a taxel is from the object: closed forms of the solver's primitives (for a mesh: of the boxes that
     follow it), a grid baked from the mesh, or the nearest of points on the surface, as in the paper."""
-    touch: bool = setting(True)
-    """Feel with the taxels; off only to measure their cost."""

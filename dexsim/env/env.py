@@ -53,6 +53,7 @@ class Env:
         check_timestep(hand, config.physics, config.randomization)
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
         self.spec = TaskSpec.of(task)  # what a host must know to run this task's policies
+        self.spec.check_hand(hand)
         self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
@@ -61,14 +62,9 @@ class Env:
         self.observer = Observer(config, hand, task)
         self.sampler = EpisodeSampler(config, hand, task, self.senses)
         self.observation_layout = self.observer.layout
-        self.pool = task.make_pool(jax.random.key(seed))
-
-    @property
-    def control_period(self) -> float:
+        self.control_period = config.physics.control_period
         """One control tick, s."""
-        return self.config.physics.control_period
-
-    # --- life of an episode ---------------------------------------------------------------
+        self.pool = task.make_pool(jax.random.key(seed))
 
     def reset(self, key: jax.Array, scale: jax.Array | None = None) -> State:
         """A new episode from a random start state.
@@ -89,17 +85,15 @@ class Env:
         joints = start.qpos[self.physics.joint_qpos]
         target, zero = joints if start.joint_target is None else start.joint_target, jnp.zeros(self.action_size)
         command = JointCommand(action=zero, target=target, previous=target, valid=jnp.ones((), bool))
-        rest = StepResult(
-            PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv)),
-            jnp.zeros((self.hand.num_fingers, 3)),
-        )
-        truth = self._ground_truth(episode, rest, (zero, jnp.zeros(self.action_size, bool)), zero, zero)
+        rest = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
+        result, torque = StepResult(rest, jnp.zeros((self.hand.num_fingers, 3))), (zero, jnp.zeros(zero.shape, bool))
+        truth = self._ground_truth(episode, result, torque, zero, zero)
         false, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         _, metrics = reward_of(self.task, goal, truth, false)  # an episode's start earns nothing
         return State(
             key=key,
             episode=episode,
-            physics=rest.state,
+            physics=rest,
             previous_target=target,
             tick=none,
             length=none,
@@ -109,7 +103,7 @@ class Env:
             truncated=false,
             metrics=metrics | _common_metrics(episode, truth, jnp.zeros(()), none, ~false),
             scale=scale,
-            **self._observed(noise_key, episode, command, goal, truth, None),
+            **self._observe(noise_key, episode, command, goal, truth, None),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -126,21 +120,14 @@ class Env:
         command = self._control(state, action)
         law = self.motors.law(hand, command)
         push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
-        held = self.task.held(state.goal)
-        if held is not None:
-            push = jnp.where(held, -episode.object.mass * jnp.asarray(self.task.gravity), push)
-        result = self.physics.advance(
-            law, episode.object, state.physics, push, state.tip_stiffness, hand.pad_thickness_delta
-        )
+        held, delta = self.task.held(state.goal), hand.pad_thickness_delta
+        result = self.physics.advance(law, episode.object, state.physics, push, state.tip_stiffness, delta, held)
         result, finite = revert_if_diverged(result, state.physics, command.valid)
-        if held is not None:
-            result = result._replace(state=self._hold(held, state.physics, result.state))
         torque = self.motors.current_torque(hand, command, result.state)
-
         truth = self._ground_truth(episode, result, torque, command.action, state.action)
-        goal = self.task.update(goal_key, state.goal, truth)
-        observed = self._observed(noise_key, episode, command, goal, truth, state)
 
+        goal = self.task.update(goal_key, state.goal, truth)
+        observed = self._observe(noise_key, episode, command, goal, truth, state)
         terminated = self.task.dropped(goal, truth) | ~finite
         reward, metrics = reward_of(self.task, state.goal, truth, terminated)
         tick, ticks, total = state.tick + 1, state.length + 1, state.episode_return + reward
@@ -177,31 +164,13 @@ class Env:
         """
         return dataclasses.replace(state, scale=scale)
 
-    # --- parts of a step, in their order --------------------------------------------------
-
     def _control(self, state: State, action: jax.Array) -> JointCommand:
         """The joint targets of this tick; an action that is not finite counts as none."""
         valid = jnp.all(jnp.isfinite(action))
         action = jnp.where(valid, jnp.clip(action, -1.0, 1.0), 0.0)
         measured = state.physics.qpos[self.physics.joint_qpos]
         target = move_target(self.config.control, self.hand, state.joint_target, action, measured)
-        return JointCommand(
-            action=action,
-            target=target,
-            previous=state.joint_target,
-            valid=valid,
-            earlier=state.previous_target,
-        )
-
-    def _hold(self, held: jax.Array, before: PhysicsState, after: PhysicsState) -> PhysicsState:
-        """The physics after a tick; where `held` [] the object is where it was, at rest."""
-        place, motion = self.physics.object_qpos, self.physics.object_dof
-        still = dataclasses.replace(
-            after,
-            qpos=after.qpos.at[place].set(before.qpos[place]),
-            qvel=after.qvel.at[motion].set(0.0),
-        )
-        return choose(held, still, after)
+        return JointCommand(action, target, state.joint_target, valid, state.previous_target)
 
     def _ground_truth(
         self,
@@ -218,7 +187,7 @@ class Env:
         pose = forward_kinematics(self.hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        fingertips = self.touch.feel(pose, object, position, rotation, force, delta)
+        touch, normal_force, skin_force = self.touch.feel(pose, object, position, rotation, force, delta)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -227,9 +196,9 @@ class Env:
             torque_limited=torque[1],
             pose=pose,
             finger_force=force,
-            normal_force=fingertips.normal_force,
-            touch=fingertips.touch,
-            tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, fingertips.skin_force, delta),
+            normal_force=normal_force,
+            touch=touch,
+            tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, skin_force, delta),
             object_position=position,
             object_quat=quat,
             object_velocity=motion[:3],
@@ -238,19 +207,7 @@ class Env:
             last_action=last_action,
         )
 
-    def _sensor_input(self, state: State) -> SensorInput:
-        """What the sensors saw in a tick."""
-        qpos = state.physics.qpos
-        place = qpos[self.physics.object_qpos]
-        return SensorInput(
-            joint_position=qpos[self.physics.joint_qpos],
-            joint_torque=state.joint_torque,
-            taxel_force=state.taxel_force,
-            object_position=place[:3],
-            object_quat=place[3:] / jnp.linalg.norm(place[3:]),
-        )
-
-    def _observed(
+    def _observe(
         self,
         key: jax.Array,
         episode: Episode,
@@ -262,7 +219,7 @@ class Env:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
         now, shown = self.senses.input(truth), self.task.goal_readings(goal)
-        before = now if last is None else self._sensor_input(last)
+        before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
         readings, taxel_memory = self.senses.read(key, episode, now, before, shown, action, last)
         correction = None if last is None else last.correction
@@ -281,6 +238,12 @@ class Env:
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }
+
+    def _last_input(self, last: State) -> SensorInput:
+        """What the sensors saw in the tick that ended with this state."""
+        joints, place = last.physics.qpos[self.physics.joint_qpos], last.physics.qpos[self.physics.object_qpos]
+        quat = place[3:] / jnp.linalg.norm(place[3:])
+        return SensorInput(joints, last.joint_torque, last.taxel_force, place[:3], quat)
 
 
 def _common_metrics(

@@ -12,8 +12,8 @@ from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
 from dexsim.objects.config import BULK_RANGES
 from dexsim.objects.params import ObjectParams, redraw_bulk, toward_nominal
-from dexsim.randomization import HandParams, sample_hand, tilted_down
-from dexsim.sensing.imu import ImuParams, sample_imu
+from dexsim.randomization import sample_hand, tilted_down
+from dexsim.sensing.imu import sample_imu
 
 
 class EpisodeSampler:
@@ -22,6 +22,8 @@ class EpisodeSampler:
     def __init__(self, config: EnvConfig, hand: Hand, task: Task, senses: SensorSuite):
         self.config, self.hand, self.task, self.senses = config, hand, task, senses
         self._bulk = tuple(name for name in BULK_RANGES if f"objects.{name}" in task.object_ranges)
+        self._weight = float(np.linalg.norm(task.gravity))  # m/s^2
+        self._down = np.asarray(task.gravity, float) / np.linalg.norm(task.gravity)
 
     def sample(
         self,
@@ -39,35 +41,23 @@ class EpisodeSampler:
             task draws (`Task.object_ranges`) are drawn anew.
           scale: [] in [0, 1], narrows every range about nominal; None for 1.
         """
+        config, ranges, period = self.config, self.config.randomization, self.config.physics.control_period
         if self._bulk:
             plain = self.task.unit_inertia(object)
-            object = redraw_bulk(object_key, object, self.config.objects, plain, self._bulk)
+            object = redraw_bulk(object_key, object, config.objects, plain, self._bulk)
         if scale is not None:
-            object = toward_nominal(object, self.config.objects, self.task.unit_inertia(object), scale)
+            object = toward_nominal(object, config.objects, self.task.unit_inertia(object), scale)
         width = 1.0 if scale is None else scale
-        hand, imu = self.sample_hand(hand_key, sensor_key, width)
-        taxels = self.senses.taxels.sample(jax.random.fold_in(sensor_key, 1), width)
-        return Episode(hand=hand, object=object, imu=imu, taxels=taxels)
-
-    def sample_hand(
-        self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
-    ) -> tuple[HandParams, ImuParams]:
-        """The hand, and the object's IMU."""
-        ranges = self.config.randomization
-        hand = sample_hand(
-            hand_key,
-            ranges,
-            self.hand,
-            timestep=self.config.physics.timestep,
-            control_period=self.config.physics.control_period,
-            scale=scale,
-        )
+        times = {"timestep": config.physics.timestep, "control_period": period}
         extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
-        sensor, period = self.config.sensing.orientation, self.config.physics.control_period
-        return hand, sample_imu(sensor_key, sensor, ranges.scale * scale, period, extreme)
+        return Episode(
+            hand=sample_hand(hand_key, ranges, self.hand, **times, scale=width),
+            object=object,
+            imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
+            taxels=self.senses.taxels.sample(jax.random.fold_in(sensor_key, 1), width),
+        )
 
     def tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""
-        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
-        tilted = tilted_down(down, episode.hand.tilt)
-        return episode.object.mass * np.linalg.norm(self.task.gravity) * (tilted - jnp.asarray(down))
+        tilted = tilted_down(self._down, episode.hand.tilt)
+        return episode.object.mass * self._weight * (tilted - jnp.asarray(self._down))

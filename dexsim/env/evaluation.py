@@ -5,8 +5,6 @@ own seed, and gives every episode a row and a random key of its own: what is mea
 episodes run side by side, and episodes are independent.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
@@ -35,17 +33,14 @@ class EvaluationPlan:
 
 
 class Evaluation:
-    """The evaluation protocol of an environment's task."""
+    """The evaluation protocol of an environment's task: what `evaluate_policy` asks of an environment."""
 
     def __init__(self, env: Env):
         self.env, self.name = env, env.name
-        self.evaluation = env.task.evaluation
-        """What `summarize` is given: "series" or "totals"."""
-        self.evaluation_steps = env.task.evaluation_ticks
-        """Length of an evaluation episode, ticks."""
+        self.evaluation, self.evaluation_steps = env.task.evaluation, env.task.evaluation_ticks
 
     def evaluation_plan(self, count: int, seed: int) -> EvaluationPlan:
-        """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own."""
+        """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own (host)."""
         return make_plan(self.env.task, count, seed)
 
     def evaluation_starts(self, plan: EvaluationPlan) -> State:
@@ -68,8 +63,7 @@ def evaluation_of(env: Any) -> Any:
 
 def take_snapshot(env: Env, state: State) -> Snapshot:
     """What a frame of video shows of one environment's state."""
-    place = state.physics.qpos[env.physics.object_qpos]
-    shape = state.episode.object.shape()
+    place, shape = state.physics.qpos[env.physics.object_qpos], state.episode.object.shape()
     turning = env.task.turn is not None
     return Snapshot(
         joint_position=state.physics.qpos[env.physics.joint_qpos],
@@ -90,25 +84,20 @@ def take_snapshot(env: Env, state: State) -> Snapshot:
 
 
 def make_plan(task: Task, count: int, seed: int) -> EvaluationPlan:
-    """The plan of `count` episodes (host), from a pool with rows enough for them.
+    """The plan of `count` episodes, from a pool with rows enough for them.
 
     Raises:
       ConfigError: see `Task.make_pool`.
     """
     key = jax.random.key(seed)
-    parts = (
-        jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(jax.random.fold_in(key, _POOL), part)))
-        for part in itertools.count()
-    )
-    pool: Any = next(parts)
-    row, goal = task.evaluation_plan(count, pool.object.shape_index)
-    # A plan that repeats rows of a pool twice as large means to.
-    while len(np.unique(row)) < count and len(pool.qpos) < 2 * count:
-        pool = jax.tree.map(lambda *rows: np.concatenate(rows), pool, next(parts))
+    pool_key = jax.random.fold_in(key, _POOL)
+    pool: Any = None
+    for part in itertools.count():
+        rows = jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(pool_key, part)))
+        pool = rows if pool is None else jax.tree.map(lambda *parts: np.concatenate(parts), pool, rows)
         row, goal = task.evaluation_plan(count, pool.object.shape_index)
-    return EvaluationPlan(
-        key=jax.random.split(jax.random.fold_in(key, _EPISODES), count),
-        row=np.asarray(row),
-        start=jax.tree.map(lambda rows: rows[np.asarray(row)], pool),
-        goal=goal,
-    )
+        # A plan that repeats rows of a pool twice as large means to.
+        if len(np.unique(row)) == count or len(pool.qpos) >= 2 * count:
+            break
+    keys = jax.random.split(jax.random.fold_in(key, _EPISODES), count)
+    return EvaluationPlan(keys, np.asarray(row), jax.tree.map(lambda rows: rows[np.asarray(row)], pool), goal)

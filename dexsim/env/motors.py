@@ -86,7 +86,10 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
     Raises:
       ConfigError: names the joint and the largest stable time step.
     """
-    step, stiffness, (damping, mass) = physics.timestep, _largest_stiffness(ranges), _masses(hand)
+    high = {name: 1 + ranges.scale * (getattr(ranges, name)[1] - 1) for name in ("stiffness_factor", "efficiency")}
+    ripple = 1 + ranges.scale * ranges.ripple[1]
+    stiffness = high["efficiency"] * ripple * ranges.stiffness * high["stiffness_factor"]  # of the stiffest motor
+    damping, mass = _dynamics(hand)
 
     def largest(step: float) -> tuple[float, int]:
         """The largest eigenvalue, and the joint that moves most in it."""
@@ -95,29 +98,18 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
         worst = int(np.argmax(values.real))
         return float(values.real[worst]), int(np.argmax(np.abs(vectors[:, worst])))
 
-    value, joint = largest(step)
+    value, joint = largest(physics.timestep)
     if value < 4:
         return
-    stable = next(s for s in np.linspace(step, 0.0, 200) if largest(s)[0] < 4)
+    stable = next(s for s in np.linspace(physics.timestep, 0.0, 200) if largest(s)[0] < 4)
     raise ConfigError(
-        f"PhysicsConfig.timestep = {step:g} s: the stiffest motors drawn are unstable at joint "
+        f"PhysicsConfig.timestep = {physics.timestep:g} s: the stiffest motors drawn are unstable at joint "
         f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h d / I = {value:.2f}, must be below 4): "
         f"use at most {np.floor(stable * 1e5) / 1e5:g} s, or a lower gain (Randomization.stiffness)"
     )
 
 
-def _largest_stiffness(ranges: Randomization) -> float:
-    """k_p Nm/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
-    high = 1 + ranges.scale * (ranges.stiffness_factor[1] - 1)
-    return (
-        (1 + ranges.scale * (ranges.efficiency[1] - 1))
-        * (1 + ranges.scale * ranges.ripple[1])
-        * ranges.stiffness
-        * high
-    )
-
-
-def _masses(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+def _dynamics(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
     """Damping [J, J] Nm s/rad and mass matrix [J, J] kg m^2 of the joints with all that follows them, at the middle of
     their ranges; a finger's posture changes the smallest of them by less than 1 %."""
     model = read_mjcf(hand).compile()

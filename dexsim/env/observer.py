@@ -1,5 +1,7 @@
 """The observations of a tick: the actor's from the readings, the critic's from the truth."""
 
+import dataclasses
+
 import jax
 
 from dexsim import observation
@@ -15,17 +17,15 @@ class Observer:
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
         """Raises ConfigError: nothing is left to observe, or see `group_configs`."""
-        actor, critic = observation.group_configs(config.observation)
         self.hand, self.fields = hand, task.fields
-        self._configs = {group: actor if group == "actor" else critic for group in task.fields}
+        self._actor, self._critic = observation.group_configs(config.observation)
         self.layout = {
-            group: observation.layout(hand, names, self._configs[group]) for group, names in task.fields.items()
+            "actor": observation.layout(hand, task.fields["actor"], self._actor),
+            "critic": observation.layout(hand, task.fields["critic"], self._critic),
         }
-        for group, fields in self.layout.items():
-            if not fields:
-                raise ConfigError(
-                    f"ObservationConfig.leave_out = {self._configs[group].leave_out}: removes every {group} observation"
-                )
+        if not self.layout["actor"]:
+            left_out = config.observation.leave_out
+            raise ConfigError(f"ObservationConfig.leave_out = {left_out}: removes every actor observation")
 
     def observe(
         self, readings: Readings, truth: GroundTruth, goal: tuple[jax.Array, jax.Array]
@@ -37,25 +37,20 @@ class Observer:
           truth: for the critic.
           goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
         """
-        command, goal_quat = goal
-        true = Readings(
+        true = dataclasses.replace(
+            readings,
             joint_position=truth.joint_position,
             joint_torque=truth.joint_torque / self.hand.torque_limit,
             taxel_force=truth.touch.force,
             object_position=truth.object_position,
             object_velocity=truth.object_velocity,
             object_quat=truth.object_quat,
-            goal_quat=goal_quat,
-            command=command,
-            last_action=readings.last_action,
-            past_actions=readings.past_actions,
-            palm_gravity=readings.palm_gravity,
+            command=goal[0],
+            goal_quat=goal[1],
         )
-        motion = Motion(truth.joint_velocity, truth.object_spin)
-        # The actor's pose follows from measured angles, which are not the true ones.
-        arguments = {"actor": (readings, None), "critic": (true, truth.pose)}
+        motion, fields = Motion(truth.joint_velocity, truth.object_spin), self.fields
         return {
-            group: observation.observe(self.hand, readings_, names, self._configs[group], motion, pose)
-            for group, names in self.fields.items()
-            for readings_, pose in (arguments[group],)
+            # Its pose follows from measured angles, which are not the true ones.
+            "actor": observation.observe(self.hand, readings, fields["actor"], self._actor, motion),
+            "critic": observation.observe(self.hand, true, fields["critic"], self._critic, motion, truth.pose),
         }

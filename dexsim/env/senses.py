@@ -1,8 +1,4 @@
-"""Between the truth and the host: latency, noise, counts, and what a sensor remembers.
-
-`SensorSuite` belongs to one environment and has no state of its own; what an episode draws and what the
-taxels remember is passed in and out.
-"""
+"""Between the truth and the host: latency, noise, counts, and what a sensor remembers."""
 
 import jax
 import jax.numpy as jnp
@@ -42,13 +38,8 @@ class SensorSuite:
 
     def input(self, truth: GroundTruth) -> SensorInput:
         """What the sensors see after a tick."""
-        return SensorInput(
-            joint_position=truth.joint_position,
-            joint_torque=truth.joint_torque / self.hand.torque_limit,
-            taxel_force=truth.touch.force,
-            object_position=truth.object_position,
-            object_quat=truth.object_quat,
-        )
+        torque = truth.joint_torque / self.hand.torque_limit
+        return SensorInput(truth.joint_position, torque, truth.touch.force, truth.object_position, truth.object_quat)
 
     def read(
         self,
@@ -83,8 +74,12 @@ class SensorSuite:
             joints = jnp.round(joints / sensing.joint_resolution) * sensing.joint_resolution
         torque = late.joint_torque * hand.torque_gain
         torque = torque + sensing.torque_noise * jax.random.normal(keys[1], torque.shape)
-        taxels, memory = self._read_taxels(keys[2], late, episode, last)
+        memory = self.taxels.init() if last is None else last.taxel_memory
+        memory, taxels = self.taxels.apply(episode.taxels, memory, keys[2], late.taxel_force, hand.taxel_gain)
         position, velocity = self._read_place(keys[3], late, last)
+        past = last_action, last_action
+        if last is not None:
+            past = last.readings.last_action, last.readings.past_actions[0]
         command, goal_quat = goal
         readings = Readings(
             joint_position=joints,
@@ -96,30 +91,22 @@ class SensorSuite:
             goal_quat=goal_quat,
             command=command,
             last_action=last_action,
-            past_actions=self._past_actions(last_action, last),
+            past_actions=jnp.stack(past),
             palm_gravity=self._palm_gravity(episode),
         )
         return readings, memory
 
-    def _past_actions(self, last_action: jax.Array, last: State | None) -> jax.Array:
-        if last is None or last.readings.past_actions is None:
-            return jnp.stack([last_action, last_action])
-        return jnp.stack([last.readings.last_action, last.readings.past_actions[0]])
-
     def _palm_gravity(self, episode: Episode) -> jax.Array:
         """Where gravity [3] points, by an IMU whose frame the object's pose at rest has aligned, with that error."""
-        down = tilted_down(-np.asarray(self._up), episode.hand.tilt)
-        bias = episode.imu.bias
+        down, bias = tilted_down(-np.asarray(self._up), episode.hand.tilt), episode.imu.bias
         angle = jnp.sqrt(jnp.sum(bias**2) + 1e-20)
         return rotations.rotate(rotations.quat_to_matrix(rotations.axis_angle_to_quat(bias / angle, angle)), down)
 
     def _read_place(self, key: jax.Array, late: SensorInput, last: State | None) -> tuple[jax.Array, jax.Array]:
         """The object's position [3] m and the filtered estimate of its velocity [3] m/s."""
-        sensing = self.config.sensing
+        sensing, reference = self.config.sensing, jnp.asarray(self.task.reference)
         noise = sensing.object_noise * jax.random.normal(key, (3,))
-        position = jnp.where(
-            jnp.array(sensing.object_axes), late.object_position + noise, jnp.asarray(self.task.reference)
-        )
+        position = jnp.where(jnp.array(sensing.object_axes), late.object_position + noise, reference)
         if last is None:
             return position, jnp.zeros(3)
         step = (position - last.readings.object_position) / self.period
@@ -130,28 +117,8 @@ class SensorSuite:
         self, key: jax.Array, now: SensorInput, before: SensorInput, episode: Episode, last: State | None
     ) -> jax.Array:
         """The object's orientation [4] by its IMU, which has just read for the first time at an episode's start."""
-        length, held = (
-            (jnp.zeros(()), now.object_quat)
-            if last is None
-            else (last.length.astype(jnp.float32) + 1.0, last.readings.object_quat)
-        )
-        return measure_orientation(
-            key,
-            self.config.sensing.orientation,
-            episode.imu,
-            length,
-            now.object_quat,
-            before.object_quat,
-            held,
-            self._up,
-            self.period,
-        )
-
-    def _read_taxels(
-        self, key: jax.Array, late: SensorInput, episode: Episode, last: State | None
-    ) -> tuple[jax.Array, TaxelMemory]:
-        memory = self.taxels.init() if last is None else last.taxel_memory
-        if not self.config.touch:
-            return late.taxel_force, memory
-        memory, taxels = self.taxels.apply(episode.taxels, memory, key, late.taxel_force, episode.hand.taxel_gain)
-        return taxels, memory
+        length, held = jnp.zeros(()), now.object_quat
+        if last is not None:
+            length, held = last.length.astype(jnp.float32) + 1.0, last.readings.object_quat
+        quats, config = (now.object_quat, before.object_quat, held), self.config.sensing.orientation
+        return measure_orientation(key, config, episode.imu, length, *quats, self._up, self.period)

@@ -1,17 +1,8 @@
 """What a task is: the truth that it sees, and the rules that it adds.
 
-A task of one's own is a subclass of `Task`, made from a configuration and a hand, and registered:
-
-    class Lift(dexsim.Task):
-        name = "lift"
-        ...
-        def __init__(self, config: LiftConfig, hand: Hand): ...
-
-    dexsim.register("lift", Lift)
-    env = dexsim.make("lift")
-
-SI units; positions, velocities and forces are in the palm frame, quaternions (w, x, y, z). Shapes: J joints, F
-fingers, N taxels a finger, K primitives of an object, P start states.
+A task of one's own is a subclass of `Task`, made from a configuration and a hand, and registered by `dexsim.register`.
+SI units; positions, velocities and forces are in the palm frame, quaternions (w, x, y, z). Shapes: J joints, F fingers,
+N taxels a finger, K primitives of an object, P start states.
 """
 
 import abc

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
@@ -14,17 +13,8 @@ from dexsim.touch.feel import Touch, feel_links, keep_normal_part
 from dexsim.touch.surface import skin_surface, taxels_only, whole_surface
 
 
-@pytree_dataclass
-class FingertipTouch:
-    """What the fingertips feel in a tick; F fingers, N taxels."""
-
-    touch: Touch  # [F, N]
-    normal_force: jax.Array  # [F] N, what of the finger's force presses into its skin, with or without taxels
-    skin_force: jax.Array  # [F] N, by the skin's law, of all skin that bears load: for the contact's springs
-
-
 class TouchModel:
-    """Taxels and skin of one environment's hand. Pure methods."""
+    """Taxels and skin of one environment's hand."""
 
     def __init__(self, config: EnvConfig, hand: Hand):
         skin = config.skin
@@ -34,7 +24,7 @@ class TouchModel:
         self.geometry = touch_geometry(config.objects, config.touch_method)
         # Whether the taxels' forces are those of the springs: the same points, geometry and rubber.
         same_rubber = skin.margin == config.physics.pad_thickness
-        self._shared = config.touch and config.touch_method == "closed_form" and not skin.untaxelled and same_rubber
+        self._shared = config.touch_method == "closed_form" and not skin.untaxelled and same_rubber
 
     def feel(
         self,
@@ -44,30 +34,31 @@ class TouchModel:
         rotation: jax.Array,
         force: jax.Array,
         pad_thickness_delta: jax.Array | float = 0.0,
-    ) -> FingertipTouch:
-        """The taxels' forces.
+    ) -> tuple[Touch, jax.Array, jax.Array]:
+        """What the fingertips feel in a tick.
 
         Args:
           pose: of the hand.
           object, position [3] m, rotation [3, 3]: the object and where it is, palm frame.
           force: [F, 3] N, of the object on the finger tips, palm frame.
           pad_thickness_delta: [] m, change of the rubber's thickness from `Skin.margin`.
+
+        Returns:
+          The taxels' depths and forces; the part [F] N of `force` that presses into the skin, with or without taxels;
+          the force [F] N, by the skin's law, of all skin that bears load, for the contact's springs.
         """
         hand, skin, place = self.hand, self.config.skin, (position, rotation)
-        nothing = jnp.zeros(hand.taxel_area.shape)
-        touch, normal = Touch(nothing, nothing, nothing), jnp.zeros(hand.num_fingers)
-        if self.config.touch:
-            surface, geometry = self._surface, self.geometry(object)
-            touch = feel_links(hand, pose, geometry, *place, length(force), skin, surface, pad_thickness_delta)
-            # In the links' frames, where the normals are constants.
-            local = rotations.rotate_inverse(pose.tip_rotation, force)
-            pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
-            normal = jnp.sum(pressed.force, -1)
-            touch = pressed if skin.total == "pressing" else touch
+        surface, geometry = self._surface, self.geometry(object)
+        touch = feel_links(hand, pose, geometry, *place, length(force), skin, surface, pad_thickness_delta)
+        # In the links' frames, where the normals are constants.
+        local = rotations.rotate_inverse(pose.tip_rotation, force)
+        pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
+        normal = jnp.sum(pressed.force, -1)
+        touch = pressed if skin.total == "pressing" else touch
         if self._shared:
-            return FingertipTouch(touch, normal, jnp.sum(touch.skin_force, -1))
+            return touch, normal, jnp.sum(touch.skin_force, -1)
         delta = jnp.maximum(pad_thickness_delta, -self.config.physics.pad_thickness)  # the solver's
         unit = jnp.ones(hand.num_fingers)
         bearing = feel_links(hand, pose, object.shape(), *place, unit, skin, self._bearing, delta)
         touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
-        return FingertipTouch(touch, normal, jnp.sum(bearing.skin_force, -1))
+        return touch, normal, jnp.sum(bearing.skin_force, -1)

@@ -15,8 +15,8 @@ of the process. An FFI call does neither, and gets XLA's buffers as NumPy arrays
 import collections
 import contextlib
 import dataclasses
+import functools
 import hashlib
-import json
 import math
 import os
 import threading
@@ -34,12 +34,18 @@ from dexsim.core.compilation import available_cores
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import ffi
-from dexsim.physics.interface import ContactParams, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
+from dexsim.physics.interface import (
+    ContactParams,
+    ImplicitLaw,
+    PhysicsScene,
+    PhysicsState,
+    StepResult,
+    places,
+    values,
+)
 from dexsim.physics.law import evaluator, record
-from dexsim.physics.parameters import places, values
 
 TARGET = "dexsim_host"
-_SIZES_KEPT = 8
 _WARNINGS = mujoco.mjtWarning
 _FULL = [_WARNINGS.mjWARN_CONTACTFULL.value, _WARNINGS.mjWARN_CNSTRFULL.value]
 # MuJoCo resets a world that is not a number, or out of bounds.
@@ -67,12 +73,7 @@ class CBackend:
         self._tick.defjvp(_no_gradient)
 
     def advance(
-        self,
-        object: ObjectParams,
-        contacts: ContactParams,
-        state: PhysicsState,
-        law: ImplicitLaw,
-        push: jax.Array,
+        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
     ) -> StepResult:
         """One control tick in one call."""
         fields = values(self.scene, object, contacts)
@@ -86,9 +87,8 @@ class CBackend:
         whole batch shares."""
         state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
         force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
-        head = json.dumps({"engine": self._key, "fields": fields})
         call = jax.ffi.ffi_call(TARGET, [*state, force], vmap_method="expand_dims")
-        return list(call(*arguments, head=head, law=law))
+        return list(call(*arguments, engine=self._key, fields=" ".join(fields), law=law))
 
 
 def _no_gradient(*_: Any) -> Any:
@@ -98,14 +98,11 @@ def _no_gradient(*_: Any) -> Any:
 class _Worlds:
     """Worlds that differ in some fields of the model, and the arrays through which they are written and read."""
 
-    def __init__(self, scene: PhysicsScene, size: int, fields: list[str]):
-        self.size, self.process = size, os.getpid()
+    def __init__(self, scene: PhysicsScene, size: int, fields: tuple[str, ...]):
+        self.process = os.getpid()
         # One thread for each core that this process may use.
         self.batch = Batch(scene.model, size, available_cores())
-        where = {
-            name: (slice(None), *(index if isinstance(index, tuple) else (index,)))
-            for name, index in places(scene).items()
-        }
+        where = places(scene)
         self._fields = [[(self.batch.expand(name), where[name])] for name in fields]
         # The subtree of the object's body is the object.
         self._fields[fields.index("body_mass")].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
@@ -119,7 +116,7 @@ class _Worlds:
         """Write the models' fields."""
         for targets, value in zip(self._fields, values, strict=True):
             for array, where in targets:
-                array[where] = value
+                array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
 
 
 class HostEngine:
@@ -128,36 +125,27 @@ class HostEngine:
     def __init__(self, scene: PhysicsScene):
         """`scene` has a contact sensor for each fingertip."""
         self.scene = scene
-        self._worlds: collections.OrderedDict[tuple[int, tuple[str, ...]], _Worlds] = collections.OrderedDict()
+        # Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
+        self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
         self.diverged = 0
         """World-ticks so far that MuJoCo gave up: not a number, or out of bounds."""
 
-    def _batch(self, size: int, fields: list[str]) -> _Worlds:
-        """Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
+    def tick(self, fields: tuple[str, ...], law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
+        """A control tick of a batch; see `CBackend._call` for what crosses.
 
         Raises:
           RuntimeError: in a forked child, which has none of its parent's threads.
         """
-        key = size, tuple(fields)
-        if key not in self._worlds:
-            self._worlds[key] = _Worlds(self.scene, size, fields)
-            while len(self._worlds) > _SIZES_KEPT:
-                self._worlds.popitem(last=False)
-        self._worlds.move_to_end(key)
-        if self._worlds[key].process != os.getpid():
-            raise RuntimeError(
-                "backend 'c' does not work in a forked process, which lacks its threads: "
-                "start processes with multiprocessing.get_context('spawn')"
-            )
-        return self._worlds[key]
-
-    def tick(self, fields: list[str], law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
-        """A control tick of a batch; see `CBackend._call` for what crosses."""
         shape = out[0].shape[:-1]
         rank, size = len(shape), math.prod(shape)
         inputs = [_flatten(x, shape, rank, size) for x in arguments]
         with _lock, _no_warnings():
-            worlds = self._batch(size, fields)
+            worlds = self._worlds(size, fields)
+            if worlds.process != os.getpid():
+                raise RuntimeError(
+                    "backend 'c' does not work in a forked process, which lacks its threads: "
+                    "start processes with multiprocessing.get_context('spawn')"
+                )
             worlds.configure(inputs[: len(fields)])
             results = self._run(worlds, law, inputs[len(fields) :])
             for target, value in zip(out, results, strict=True):
@@ -170,7 +158,7 @@ class HostEngine:
         worlds.qpos[:], worlds.qvel[:], worlds.warmstart[:] = qpos, qvel, warmstart
         worlds.wrench[:, scene.object_body, :3] = push
         warning[:] = 0
-        motors, dofs = evaluator(law).bind(constants), scene.joint_dof
+        motors, dofs = evaluator(law)(constants), scene.joint_dof
         armature = scene.model.dof_armature[dofs]
         for substep in range(scene.config.substeps):
             position = worlds.qpos[:, scene.joint_qpos].astype(qpos.dtype)
@@ -196,11 +184,11 @@ _newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
 def _serve(frame: Any) -> None:
     """A call of XLA's (`CBackend._call`)."""
     attributes = ffi.attributes(frame)
-    head = json.loads(attributes["head"])
-    engine = _engines.get(head["engine"])
+    engine = _engines.get(attributes["engine"].decode())
     if engine is None:
         raise RuntimeError("backend 'c': the environment of this program no longer exists")
-    engine.tick(head["fields"], attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
+    fields = tuple(attributes["fields"].decode().split())
+    engine.tick(fields, attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
 
 
 def _digest(scene: PhysicsScene) -> str:

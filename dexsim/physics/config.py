@@ -20,15 +20,9 @@ class PhysicsConfig(Config):
     tolerance: float = setting(1e-8, unit="1", low=0.0, high=1e-2)
     """MuJoCo's `tolerance`: the solver stops when neither cost nor gradient would improve by more. cuda, in single
     precision, stops at its own if that is coarser."""
-    friction_ratio: float = setting(20.0, unit="1", low=0.1, high=1000.0)
-    """How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
     pad_thickness: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Thickness of the rubber over the fingertips, by which their geoms are enlarged. Keep it equal to `Skin.margin`,
     so that contact begins at the same distance for solver and taxels."""
-    pad_points: int = setting(3, unit="1", low=1, high=8)
-    """Spheres in a row that replace each capsule of a fingertip in contacts with the object."""
-    settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
-    """Time scale on which a contact resolves penetration (at least three time steps)."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -42,8 +36,3 @@ class PhysicsConfig(Config):
     def control_period(self) -> float:
         """One control tick, s."""
         return self.timestep * self.substeps
-
-    @property
-    def contact_period(self) -> float:
-        """`settling`, s, as far as the time step allows."""
-        return max(self.settling, 3 * self.timestep)

@@ -31,30 +31,31 @@ NOMINAL = 1700.0
 SOFTEST, STIFFEST = 0.25, 4.0
 # m, depth below which springs are the nominal ones: there the skin's law is the lattice's coarseness.
 BLEND_DEPTH = 0.0005
+# s, time scale on which a contact resolves penetration: three of the longest time steps, below which it is unstable.
+PERIOD = 0.03
+# Spheres in a row that replace each capsule of a fingertip in contacts with the object.
+_POINTS = 3
 
 
-def spring(
-    compliance: Array, stiffness: Array, ratio: jax.Array | float, *, period: float
-) -> tuple[jax.Array, jax.Array]:
+def spring(compliance: Array, stiffness: Array, ratio: jax.Array | float) -> tuple[jax.Array, jax.Array]:
     """MuJoCo's parameters for contacts that press with `stiffness` times depth at rest.
 
     MuJoCo's own parameters fix accelerations instead. With an elliptic cone the force at rest is
     N = k d^2 r / (A (1 - d)) for a depth r, an impedance d, a reference stiffness k and the inverse weights A
     of the two bodies (documentation, chapter Computation, section Constraint model). Here
-    k = 1 / (period^2 d), and d follows from N = stiffness r.
+    k = 1 / (PERIOD^2 d), and d follows from N = stiffness r.
 
     Args:
       compliance: [P] 1/kg, inverse weights A of the two bodies of each pair.
       stiffness: [P] N/m.
       ratio: [] damping ratio.
-      period: s, time scale on which a contact resolves penetration.
 
     Returns:
       solref [P, 2] (direct format) and solimp [P, 5].
     """
-    load = stiffness * compliance * period**2
+    load = stiffness * compliance * PERIOD**2
     impedance = jnp.clip(load / (1 + load), 1e-3, 0.9999)
-    solref = jnp.stack([-impedance / period**2, -2 * ratio / period * impedance], -1)
+    solref = jnp.stack([-impedance / PERIOD**2, -2 * ratio / PERIOD * impedance], -1)
     flat = jnp.broadcast_to(jnp.array([0.001, 0.5, 2.0]), (*impedance.shape, 3))
     return solref, jnp.concatenate([impedance[:, None], impedance[:, None], flat], -1)
 
@@ -112,8 +113,8 @@ def _growth(kind: int) -> np.ndarray:
     return np.array([1.0, 0.0, 0.0]) if round_ else np.ones(3)
 
 
-def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int) -> list[str]:
-    """Place a row of `points` spheres in every capsule of a fingertip that touches.
+def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str]) -> list[str]:
+    """Place a row of spheres in every capsule of a fingertip that touches.
 
     The capsules remain for contacts with anything but the object.
 
@@ -127,7 +128,7 @@ def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int
         if place.body not in hand.tip_body or place.kind != "capsule":
             names.append(name)
             continue
-        for index, along in enumerate(np.linspace(-1.0, 1.0, points) if points > 1 else [0.0]):
+        for index, along in enumerate(np.linspace(-1.0, 1.0, _POINTS)):
             ball = geom.parent.add_geom(
                 name=f"{name}/{index}",  # a hand may have pads called pad and pad_1
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -173,9 +174,8 @@ def follow_skin(
 ) -> jax.Array:
     """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
 
-    The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the
-    ratio is S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet, between `SOFTEST` and `STIFFEST`.
-    The first millimetre blends (`BLEND_DEPTH`).
+    The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the ratio is
+    S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet. The first half millimetre blends.
 
     Args:
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.

@@ -1,7 +1,6 @@
 """Calls of Python from a compiled XLA program, through XLA's foreign function interface (FFI), by ctypes.
 
-The structures are those of `xla/ffi/api/c_api.h`, which is an interface with a version: another major version is
-refused by XLA when the target is registered.
+The structures are those of `xla/ffi/api/c_api.h`, a versioned interface: XLA refuses to register another major version.
 """
 
 import _thread
@@ -98,13 +97,12 @@ def addresses(buffers: Any) -> list[int]:
 
 def arrays(buffers: Any) -> list[np.ndarray]:
     """The buffers of a CPU as NumPy arrays, valid during the call only."""
-    return [_array(Buffer.from_address(address)) for address in addresses(buffers)]
-
-
-def _array(buffer: Any) -> np.ndarray:
-    shape, dtype = buffer.dims[: buffer.rank], np.dtype(_DTYPES[buffer.dtype])
-    memory = (ctypes.c_char * (math.prod(shape) * dtype.itemsize)).from_address(buffer.data or 0)
-    return np.ndarray(shape, dtype, memory)
+    views = []
+    for buffer in map(Buffer.from_address, addresses(buffers)):
+        shape, dtype = buffer.dims[: buffer.rank], np.dtype(_DTYPES[buffer.dtype])
+        memory = (ctypes.c_char * (math.prod(shape) * dtype.itemsize)).from_address(buffer.data or 0)
+        views.append(np.ndarray(shape, dtype, memory))
+    return views
 
 
 def attributes(frame: Any) -> dict[str, bytes]:

@@ -7,6 +7,7 @@ in the same precision and order; results differ where XLA fuses a product and a 
 
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Callable
 from typing import Any
@@ -101,24 +102,12 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
       ConfigError: it has an operation that is not element by element.
     """
     traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
-    writer = _Writer()
-    inputs = [writer.new() for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)]
-    return Recorded(traced.consts, writer.literals, writer.steps, *writer.run(traced.jaxpr, inputs))
+    literals: list[list[Any]] = []
+    steps: list[list[Any]] = []
+    numbers = itertools.count()
 
-
-class _Writer:
-    """Turns a jaxpr into the steps and literals of `Recorded`."""
-
-    def __init__(self):
-        self.steps: list[list[Any]] = []
-        self.literals: list[list[Any]] = []
-        self._count = 0
-
-    def new(self) -> int:
-        self._count += 1
-        return self._count - 1
-
-    def run(self, jaxpr: Any, inputs: list[int]) -> list[int]:
+    def run(jaxpr: Any, inputs: list[int]) -> list[int]:
+        """Numbers of a jaxpr's results."""
         names = dict(zip((*jaxpr.constvars, *jaxpr.invars), inputs, strict=True))
 
         def read(variable: Any) -> int:
@@ -126,35 +115,40 @@ class _Writer:
                 return names[variable]
             if np.ndim(variable.val):
                 raise _unknown("an array that is written into it")
-            number = self.new()
-            self.literals.append([number, np.asarray(variable.val).item(), str(variable.aval.dtype)])
-            return number
+            literals.append([next(numbers), np.asarray(variable.val).item(), str(variable.aval.dtype)])
+            return literals[-1][0]
 
         for equation in jaxpr.eqns:
-            operands, kind, options = [read(v) for v in equation.invars], equation.primitive.name, equation.params
+            operands, options = [read(v) for v in equation.invars], equation.params
             inner = options.get("jaxpr", options.get("call_jaxpr"))
-            if inner is not None and kind in _CALLS and not inner.consts:
-                numbers = self.run(inner.jaxpr, operands)
+            if inner is not None and equation.primitive.name in _CALLS and not inner.consts:
+                results = run(inner.jaxpr, operands)
             else:
-                numbers = [self._step(kind, operands, equation)]
-            names.update(zip(equation.outvars, numbers, strict=True))
+                kind, parameter = _operation(equation)
+                results = [next(numbers)]
+                steps.append([kind, operands, results[0], parameter])
+            names.update(zip(equation.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def _step(self, kind: str, operands: list[int], equation: Any) -> int:
-        parameter: Any = None
-        if kind == "broadcast_in_dim" and len(operands) == 1:
-            parameter = [list(equation.params["shape"]), list(equation.params["broadcast_dimensions"])]
-        elif kind == "convert_element_type":
-            parameter = str(np.dtype(equation.params["new_dtype"]))
-        elif kind in ("reshape", "squeeze"):
-            kind, parameter = "reshape", list(equation.outvars[0].aval.shape)
-        elif kind not in OPERATIONS:
-            raise _unknown(kind)
-        elif kind in _LOGICAL and (equation.invars[0].aval.dtype != bool or len(operands) > 3):
-            raise _unknown(f"{kind} of {equation.invars[0].aval.dtype}")
-        number = self.new()
-        self.steps.append([kind, operands, number, parameter])
-        return number
+    inputs = [next(numbers) for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)]
+    torque, inertia = run(traced.jaxpr, inputs)
+    return Recorded(traced.consts, literals, steps, torque, inertia)
+
+
+def _operation(equation: Any) -> tuple[str, Any]:
+    """An equation's operation and its parameter."""
+    kind, options = equation.primitive.name, equation.params
+    if kind == "broadcast_in_dim" and len(equation.invars) == 1:
+        return kind, [list(options["shape"]), list(options["broadcast_dimensions"])]
+    if kind == "convert_element_type":
+        return kind, str(np.dtype(options["new_dtype"]))
+    if kind in ("reshape", "squeeze"):
+        return "reshape", list(equation.outvars[0].aval.shape)
+    if kind not in OPERATIONS:
+        raise _unknown(kind)
+    if kind in _LOGICAL and (equation.invars[0].aval.dtype != bool or len(equation.invars) > 3):
+        raise _unknown(f"{kind} of {equation.invars[0].aval.dtype}")
+    return kind, None
 
 
 def _unknown(what: str) -> ConfigError:
@@ -163,39 +157,37 @@ def _unknown(what: str) -> ConfigError:
     )
 
 
-class Evaluator:
-    """A recorded law for a batch, in NumPy: every array has one batch axis in front, of length one if it is shared."""
-
-    def __init__(self, text: bytes):
-        self._inputs, literals, steps, *self._results = json.loads(text)
-        self._literals = {number: np.asarray(value, dtype) for number, value, dtype in literals}
-        # What depends on constants alone is the same at all sub-steps of a tick.
-        moving, self._once, self._always = set(self._inputs), list[Any](), list[Any]()
-        for step in steps:
-            _, operands, number, _ = step
-            changes = not moving.isdisjoint(operands)
-            (self._always if changes else self._once).append(step)
-            if changes:
-                moving.add(number)
-
-    def bind(self, constants: list[np.ndarray]) -> Callable[[int, np.ndarray, np.ndarray], list[np.ndarray]]:
-        """The law of some constants: sub-step, position and velocity [B, J] to torque [B, J] Nm and inertia [B, J]."""
-        fixed = dict(enumerate(constants)) | self._literals
-        _evaluate(self._once, fixed)
-
-        def law(substep: int, position: np.ndarray, velocity: np.ndarray) -> list[np.ndarray]:
-            inputs = np.asarray(substep, np.int32), position, velocity
-            values = fixed | dict(zip(self._inputs, inputs, strict=True))
-            _evaluate(self._always, values)
-            return [values[number] for number in self._results]
-
-        return law
+BatchLaw = Callable[[int, np.ndarray, np.ndarray], list[np.ndarray]]
+"""Sub-step, position rad and velocity rad/s [B, J] to torque Nm and inertia kg m^2 [B, J]."""
 
 
 @functools.lru_cache(maxsize=64)
-def evaluator(text: bytes) -> Evaluator:
-    """The evaluator of `Recorded.text`."""
-    return Evaluator(text)
+def evaluator(text: bytes) -> Callable[[list[np.ndarray]], BatchLaw]:
+    """`Recorded.text` as a function of the law's constants, in NumPy: every array has a batch axis in front, of length
+    one if the whole batch shares it."""
+    inputs, literals, steps, *results = json.loads(text)
+    written = {number: np.asarray(value, dtype) for number, value, dtype in literals}
+    # What depends on constants alone is the same at all sub-steps of a tick.
+    moving, once, always = set(inputs), list[Any](), list[Any]()
+    for step in steps:
+        _, operands, number, _ = step
+        changes = not moving.isdisjoint(operands)
+        (always if changes else once).append(step)
+        if changes:
+            moving.add(number)
+
+    def bind(constants: list[np.ndarray]) -> BatchLaw:
+        fixed = dict(enumerate(constants)) | written
+        _evaluate(once, fixed)
+
+        def law(substep: int, position: np.ndarray, velocity: np.ndarray) -> list[np.ndarray]:
+            values = fixed | dict(zip(inputs, (np.asarray(substep, np.int32), position, velocity), strict=True))
+            _evaluate(always, values)
+            return [values[number] for number in results]
+
+        return law
+
+    return bind
 
 
 def _evaluate(steps: list[Any], values: dict[int, np.ndarray]) -> None:

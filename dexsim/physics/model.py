@@ -1,5 +1,7 @@
 """The scene that the physics runs: hand, object and explicit contact pairs in one MuJoCo model."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 
@@ -8,7 +10,6 @@ from dexsim.hand.kinematics import Hand
 from dexsim.hand.mjcf import read_mjcf
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.guard import check_model
 from dexsim.physics.interface import PhysicsScene
 
 # Newton iterations and evaluations of a line search with which forces have converged. c and cuda stop by themselves,
@@ -17,6 +18,10 @@ from dexsim.physics.interface import PhysicsScene
 CONVERGED = {"c": (20, 50), "cuda": (10, 10), "mjx": (10, 10)}
 _MJX_CONTACTS = 20
 """Contacts that MJX keeps in an environment, the deepest: memory and time grow with them."""
+_FRICTION_RATIO = 20.0
+"""How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
+_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper")
+"""Flags that say what a hand is like; gravity is the task's, and others say how MuJoCo works it out."""
 
 
 def build_scene(
@@ -37,15 +42,14 @@ def build_scene(
     spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     touching = _touching_geoms(hand, slots)
     contact.thicken_tips(spec, hand, config.pad_thickness)
-    touching = contact.split_pads(spec, hand, touching, config.pad_points)
+    touching = contact.split_pads(spec, hand, touching)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
 
     plain = mujoco.MjSpec()  # Its defaults are MuJoCo's: those of the hand's file are for the hand.
     # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
-    body = spec.worldbody.add_body(
-        name="object", mass=0.1, inertia=[5e-5] * 3, explicitinertial=True, pos=[0.1, 0, 0.1]
-    )
+    bulk = {"mass": 0.1, "inertia": [5e-5] * 3, "explicitinertial": True}
+    body = spec.worldbody.add_body(name="object", pos=[0.1, 0, 0.1], **bulk)
     body.add_freejoint(name="object")
     for k, kind in enumerate(slots):
         body.add_geom(
@@ -60,13 +64,8 @@ def build_scene(
             rgba=[0.85, 0.55, 0.25, 1],
         )
         for name in touching:
-            spec.add_pair(
-                plain.default,
-                geomname1=name,
-                geomname2=f"object_{k}",
-                condim=3,
-                friction=[0.9, 0.9, 0.005, 1e-4, 1e-4],
-            )
+            friction = [0.9, 0.9, 0.005, 1e-4, 1e-4]
+            spec.add_pair(plain.default, geomname1=name, geomname2=f"object_{k}", condim=3, friction=friction)
     if backend != "mjx":  # it has no sensor that matches bodies
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
@@ -92,9 +91,7 @@ def build_scene(
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
     pairs, tips = contact.pairs_with(model, geoms), tip_bodies(model, hand)
     compliance, share, _ = contact.pair_constants(model, pairs, tips)
-    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
-        compliance, share * contact.NOMINAL, 2.0, period=config.contact_period
-    )
+    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(compliance, share * contact.NOMINAL, 2.0)
     rubber, growth = contact.rubber_geoms(model, pairs, tips)
     return PhysicsScene(
         hand=hand,
@@ -143,7 +140,7 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # A pyramid approximates the cone, and objects creep through the fingers at 12 to 25 mm/s with it.
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, config.friction_ratio
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, _FRICTION_RATIO
     option.iterations, option.ls_iterations = CONVERGED[backend]
     option.iterations, option.tolerance = config.iterations or option.iterations, config.tolerance
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
@@ -159,3 +156,46 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     for own in [numeric for numeric in spec.numerics if numeric.name in ("max_contact_points", "max_geom_pairs")]:
         spec.delete(own)
     spec.add_numeric(name="max_contact_points", data=[_MJX_CONTACTS], size=1)
+
+
+def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
+    """Raise AssetError naming every feature of a hand that our scene drops or MJX silently ignores, and the elements
+    that have it: a policy trained on such a model would be for a hand that does not exist."""
+    elements = {
+        "actuator": {
+            "actuator delay": np.c_[model.actuator_delay, model.actuator_history[:, 0]],
+            "actuator armature": model.actuator_armature,
+            "actuator damping": np.c_[model.actuator_damping, model.actuator_dampingpoly],
+            "dcmotor actuator": model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR,
+            "pid actuator": model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID,
+        },
+        "sensor": {
+            "sensor delay or interval": np.c_[model.sensor_delay, model.sensor_history[:, 0], model.sensor_interval],
+            "tactile sensor": model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE,
+        },
+        "joint": {
+            "polynomial joint stiffness": model.jnt_stiffnesspoly,
+            "polynomial joint damping": model.dof_dampingpoly[model.jnt_dofadr],
+        },
+    }
+    features = []
+    for kind, values in elements.items():
+        for feature, value in values.items():
+            rows = np.flatnonzero(np.any(np.c_[value] != 0, axis=1))
+            names = [getattr(model, kind)(int(row)).name or f"#{row}" for row in rows]
+            if names:
+                features.append(f"{feature} ({kind} {', '.join(names)})")
+    option = model.opt
+    off = [f for f in _FLAGS if option.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
+    whole = {
+        "plugins": model.nplugin,
+        "flex bodies": model.nflex,
+        "SDF geoms": np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_SDF),
+        "fluid forces (density, viscosity, wind)": option.density or option.viscosity or np.any(option.wind),
+        "noslip iterations": option.noslip_iterations,
+        f"flags that disable {', '.join(off)}": off,
+        "flag override": option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE,
+    }
+    features += [feature for feature, there in whole.items() if there]
+    if features:
+        raise AssetError(f"{where}: cannot simulate: {'; '.join(features)}")

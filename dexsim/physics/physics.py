@@ -1,9 +1,10 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
 `advance` runs the scene for one control tick. Backends are `c` (C MuJoCo on the CPU's cores), `cuda` (one kernel for a
-tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device), which is not imported before a scene is compiled.
+tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device).
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -19,13 +20,26 @@ from dexsim.physics import contact
 from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.backend import CudaBackend
-from dexsim.physics.interface import Backend, ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.interface import (
+    Backend,
+    ContactParams,
+    PhysicsScene,
+    PhysicsState,
+    StepResult,
+    TorqueLaw,
+    configured,
+)
 from dexsim.physics.law import implicit
-from dexsim.physics.mjx_backend import MjxBackend
 from dexsim.physics.model import build_scene
-from dexsim.physics.parameters import configured
 
-BACKENDS: dict[str, Callable[[PhysicsScene], Backend]] = {"c": CBackend, "cuda": CudaBackend, "mjx": MjxBackend}
+
+def _mjx(scene: PhysicsScene) -> Backend:
+    from dexsim.physics.mjx_backend import MjxBackend  # MJX takes seconds to import
+
+    return MjxBackend(scene)
+
+
+BACKENDS: dict[str, Callable[[PhysicsScene], Backend]] = {"c": CBackend, "cuda": CudaBackend, "mjx": _mjx}
 
 
 def choose_backend(backend: str) -> str:
@@ -97,6 +111,7 @@ class Physics:
         push: jax.Array,
         tip_stiffness: jax.Array | None = None,
         pad_thickness_delta: jax.Array | float = 0.0,
+        held: jax.Array | None = None,
     ) -> StepResult:
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
 
@@ -106,9 +121,20 @@ class Physics:
           state: where to start from.
           push: [3] N, force on the object's centre of mass during the whole tick.
           tip_stiffness, pad_thickness_delta: see `contact_params`.
+          held: [] bool, whether somebody holds the object: weightless, it is where it was at the end; None for no.
         """
+        if held is not None:
+            push = jnp.where(held, -object.mass * jnp.asarray(self.mj_model.opt.gravity, jnp.float32), push)
         contacts = self.contact_params(object, tip_stiffness, pad_thickness_delta)
-        return self.engine.advance(object, contacts, state, implicit(law, self.config.timestep), push)
+        result = self.engine.advance(object, contacts, state, implicit(law, self.config.timestep), push)
+        if held is None:
+            return result
+        still = dataclasses.replace(
+            result.state,
+            qpos=result.state.qpos.at[self.object_qpos].set(state.qpos[self.object_qpos]),
+            qvel=result.state.qvel.at[self.object_dof].set(0.0),
+        )
+        return result._replace(state=choose(held, still, result.state))
 
     def configure(
         self,
@@ -137,9 +163,7 @@ class Physics:
         share = jnp.asarray(self._share)
         if tip_stiffness is not None:
             share *= jnp.append(tip_stiffness, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
-        solref, solimp = contact.spring(
-            self._compliance, share * object.contact[0], object.contact[1], period=self.config.contact_period
-        )
+        solref, solimp = contact.spring(self._compliance, share * object.contact[0], object.contact[1])
         return ContactParams(friction, solref, solimp, self._delta(pad_thickness_delta))
 
     def tip_stiffness(
@@ -151,14 +175,8 @@ class Physics:
         skin_force: jax.Array,
         pad_thickness_delta: jax.Array | float = 0.0,
     ) -> jax.Array:
-        """How much stiffer [F] than nominal the fingertips' springs are for their sum to be the skin's force.
-
-        Args:
-          object, position [3] m, rotation [3, 3]: the object and where it is, palm frame.
-          pose: of the hand.
-          skin_force: [F] N, what all skin that bears load presses with there, by the skin's law.
-          pad_thickness_delta: as in `contact_params`.
-        """
+        """How much stiffer [F] than nominal the fingertips' springs are for their sum to be the skin's force; arguments
+        as in `contact.follow_skin`."""
         delta = self._delta(pad_thickness_delta)
         return contact.follow_skin(self.hand, self._pads, pose, object, position, rotation, skin_force, delta)
 

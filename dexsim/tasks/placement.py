@@ -7,7 +7,7 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.core.pytree import align
 from dexsim.geometry import rotations, sdf
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.kinematics import Hand, flexion_joints, forward_kinematics
 
 
 def palm_height(hand: Hand) -> float:
@@ -17,6 +17,13 @@ def palm_height(hand: Hand) -> float:
         g.position[0] + np.abs(g.rotation[0]) @ g.size for g in palm if g.kind == "box"
     ]
     return float(max(faces, default=0.0))
+
+
+def close_fingers(hand: Hand, fingers: range) -> np.ndarray:
+    """1 for the joints [J] that close these fingers, 0 for the others."""
+    closes = np.zeros(hand.num_joints, np.float32)
+    closes[flexion_joints(hand, fingers)] = 1.0
+    return closes
 
 
 def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array, rotation: jax.Array) -> jax.Array:

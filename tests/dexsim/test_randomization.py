@@ -9,48 +9,19 @@ import numpy as np
 import pytest
 from episodes import with_episode
 
-import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.randomization import Randomization, sample_hand
 from dexsim.randomization_check.__main__ import conclude
 from dexsim.randomization_check.effects import check
-from dexsim.tasks.rotate.config import RotateConfig
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
 
 @functools.cache
-def draws(hand, config, seed=0):
+def draws(hand, config):
     """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
-    keys = jax.random.split(jax.random.key(seed), 1000)
+    keys = jax.random.split(jax.random.key(0), 1000)
     return jax.vmap(lambda key: sample_hand(key, config, hand, **TIMES))(keys)
-
-
-def test_scale_zero_is_the_nominal_hand(hand):
-    config = Randomization(scale=0.0)
-    drawn = draws(hand, config)
-    for row in range(4):
-        one = jax.tree.map(lambda x, row=row: np.asarray(x[row]), drawn)
-        np.testing.assert_array_equal(one.actuator.stiffness, np.full(12, 3.0, np.float32))
-        np.testing.assert_array_equal(one.actuator.damping, np.full(12, 0.1, np.float32))
-        np.testing.assert_array_equal(one.actuator.stall_torque, hand.torque_limit)
-        np.testing.assert_array_equal(one.actuator.no_load_speed, hand.speed_limit)
-        np.testing.assert_array_equal(one.actuator.efficiency, np.ones(12))
-        np.testing.assert_array_equal(one.torque_gain, np.ones(12))
-        np.testing.assert_array_equal(one.taxel_gain, np.ones((5, 1)))
-        motors = one.actuator
-        for zero in (
-            motors.dead_band,
-            motors.ripple,
-            motors.coulomb_friction,
-            motors.viscous_friction,
-            motors.encoder_bias,
-            one.latency,
-            one.sensing_latency,
-            one.encoder_bias,
-            one.tilt,
-        ):
-            np.testing.assert_array_equal(zero, 0)
 
 
 def quantities(hand, drawn):
@@ -116,10 +87,9 @@ def test_a_thousand_draws_fill_their_ranges_and_leave_none(hand, config):
             assert np.abs(correlation).max() < 0.15, name
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand, seed):
+def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand):
     """The same key at half the scale lands half way to nominal."""
-    nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s), seed)) for s in (0.0, 0.5, 1.0))
+    nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s))) for s in (0.0, 0.5, 1.0))
     for name in full.keys() - {"ripple_count"}:  # it has no nominal value
         wanted = (np.asarray(full[name]) + np.asarray(nominal[name])) / 2
         np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
@@ -131,11 +101,6 @@ def test_latency_is_in_substeps_and_reaches_its_bound(hand):
     assert np.all(latency == latency[:, :1])  # common to all joints
     fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
     np.testing.assert_allclose(fixed.latency, 3.0, rtol=1e-6)
-
-
-def test_latency_ends_at_two_ticks(hand):
-    latency = np.asarray(draws(hand, Randomization(latency=(0.02, 0.10))).latency)
-    assert latency.max() == pytest.approx(12) and np.mean(latency > 11.99) > 0.4
 
 
 # --- curriculum ------------------------------------------------------------------------------------
@@ -205,22 +170,6 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
     assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
     for name, rows in at_end.items():
         np.testing.assert_array_equal(rows, at_end["stiffness_factor"], err_msg=name)
-
-
-def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
-    config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, extremes=0.5, gravity_tilt=0.0))
-    env = dexsim.make("rotate", config, backend="c")
-    keys = jax.random.split(jax.random.key(0), (64, 2))
-    drawn, imu = jax.vmap(lambda two: env.sampler.sample_hand(*two))(keys)
-    extreme = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
-    ranges = config.sensing.orientation
-    for values, end in (
-        (imu.bias, ranges.bias),
-        (imu.drift[:, None], ranges.drift),
-        (imu.delay[:, None], ranges.delay[1] / env.control_period),
-    ):
-        np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), extreme)
-    assert 0.3 < np.mean(extreme) < 0.7 and len(np.unique(np.sign(imu.bias[extreme]), axis=0)) == 8
 
 
 # --- refusals ------------------------------------------------------------------------------------------

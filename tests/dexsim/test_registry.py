@@ -77,13 +77,6 @@ def test_what_a_task_lacks_is_named(hand, what):
     assert "\n" not in str(error.value)
 
 
-def test_the_same_task_may_be_registered_again_and_no_other(hand):
-    dexsim.register("mine", Mine)
-    dexsim.register("mine", Mine)
-    with pytest.raises(ConfigError, match="'grasp'.*there is a task of that name"):
-        dexsim.register("grasp", Mine)
-
-
 def test_a_module_is_named_with_the_task(hand):
     assert registry.find_task("poke_task:poke").config().gain == 3.0
     assert registry.make_task("poke", hand).name == "poke"

@@ -6,8 +6,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from dexsim.physics.interface import PhysicsScene
-from dexsim.physics.parameters import places
+from dexsim.physics.interface import PhysicsScene, places
 
 States = dict[str, np.ndarray]
 """By name, float32 [N, size]: qpos, qvel, warmstart, push, targets of the joints, and the fields of the object."""

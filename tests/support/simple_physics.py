@@ -31,7 +31,7 @@ class SimplePhysics:
     def tip_stiffness(self, object, pose, position, rotation, skin_force, pad_thickness_delta=0.0):
         return jnp.ones(5)
 
-    def advance(self, law, object, state, push, tip_stiffness=None, pad_thickness_delta=0.0):
+    def advance(self, law, object, state, push, tip_stiffness=None, pad_thickness_delta=0.0, held=None):
         del tip_stiffness, pad_thickness_delta  # nothing touches anything
 
         def substep(carry, index):
@@ -47,5 +47,8 @@ class SimplePhysics:
 
         steps = jnp.arange(self.config.substeps)
         (qpos, qvel), _ = jax.lax.scan(substep, (state.qpos, state.qvel), steps)
+        if held is not None:
+            qpos = jnp.where(held & (np.arange(19) >= 12), state.qpos, qpos)
+            qvel = jnp.where(held & (np.arange(18) >= 12), 0.0, qvel)
         force = jnp.zeros((5, 3)).at[:, 0].set(jnp.maximum(qpos[:10:2] - 0.5, 0))
         return StepResult(PhysicsState(qpos, qvel, state.warmstart), force)

@@ -15,9 +15,15 @@ from dexsim.physics.cuda import launch
 from dexsim.physics.cuda.law import PrintedLaw, print_law
 from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
 from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
-from dexsim.physics.interface import ContactParams, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
+from dexsim.physics.interface import (
+    ContactParams,
+    ImplicitLaw,
+    PhysicsScene,
+    PhysicsState,
+    StepResult,
+    values,
+)
 from dexsim.physics.law import record
-from dexsim.physics.parameters import values
 
 # Newton's method stops at this decrement at least, and its line search at this share of it: forces are then as near to
 # C MuJoCo's as float32 allows.
@@ -41,12 +47,7 @@ class CudaBackend:
         self._tick.defjvp(_no_gradient)
 
     def advance(
-        self,
-        object: ObjectParams,
-        contacts: ContactParams,
-        state: PhysicsState,
-        law: ImplicitLaw,
-        push: jax.Array,
+        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
     ) -> StepResult:
         """One control tick in one launch."""
         joints = len(self.scene.joint_dof)

@@ -1,7 +1,6 @@
 """The kernel of a scene: its source, and NVRTC, which compiles it.
 
-NVRTC comes with JAX for CUDA (`nvidia-cuda-nvrtc`) and needs neither nvcc nor CUDA's headers. What it has compiled is
-kept beside JAX's compiled programs.
+NVRTC comes with JAX for CUDA (`nvidia-cuda-nvrtc`) and needs neither nvcc nor CUDA's headers.
 """
 
 import contextlib
@@ -48,16 +47,8 @@ def source(scene: PhysicsScene, law: PrintedLaw) -> str:
     Raises:
       AssetError: the scene has what the kernel lacks.
     """
-    return "\n".join(
-        [
-            '#include "warp.cuh"',
-            declare_args(buffers(scene, law.buffers)),
-            kernel_constants(scene),
-            law.text,
-            '#include "tick.cuh"',
-            _ENTRY,
-        ]
-    )
+    args, constants = declare_args(buffers(scene, law.buffers)), kernel_constants(scene)
+    return "\n".join(['#include "warp.cuh"', args, constants, law.text, '#include "tick.cuh"', _ENTRY])
 
 
 @functools.cache

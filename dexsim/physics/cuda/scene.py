@@ -11,6 +11,7 @@ zero.
 
 import ctypes
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 
 import mujoco
@@ -75,32 +76,26 @@ def args_type(count: int) -> type[ctypes.Structure]:
 def buffers(scene: PhysicsScene, law: Sequence[Buffer]) -> list[Buffer]:
     """Arguments of the kernel in order, arrays [N, size]: inputs, the motor law's constants, outputs."""
     model, slots, pairs = scene.model, len(scene.slots), len(scene.object_pairs)
-    inputs = {
-        "qpos": model.nq,
-        "qvel": model.nv,
-        "warmstart": model.nv,
-        "push": 3,
-        "body_mass": 1,
-        "body_inertia": 3,
-        "body_ipos": 3,
-        "geom_size": 3 * (slots + len(scene.tip_geoms)),
-        "geom_pos": 3 * slots,
-        "geom_quat": 4 * slots,
-        "pair_friction": pairs,
-        "pair_solref": 2 * pairs,
-        "pair_solimp": 5 * pairs,
-    }
-    outputs = {
-        "qpos_out": model.nq,
-        "qvel_out": model.nv,
-        "warmstart_out": model.nv,
-        "finger_force": 3 * scene.hand.num_fingers,
-        "stats": 4,
-    }
     return [
-        *(Buffer(name, size) for name, size in inputs.items()),
+        Buffer("qpos", model.nq),
+        Buffer("qvel", model.nv),
+        Buffer("warmstart", model.nv),
+        Buffer("push", 3),
+        Buffer("body_mass", 1),
+        Buffer("body_inertia", 3),
+        Buffer("body_ipos", 3),
+        Buffer("geom_size", 3 * (slots + len(scene.tip_geoms))),
+        Buffer("geom_pos", 3 * slots),
+        Buffer("geom_quat", 4 * slots),
+        Buffer("pair_friction", pairs),
+        Buffer("pair_solref", 2 * pairs),
+        Buffer("pair_solimp", 5 * pairs),
         *law,
-        *(Buffer(name, size, output=True) for name, size in outputs.items()),
+        Buffer("qpos_out", model.nq, output=True),
+        Buffer("qvel_out", model.nv, output=True),
+        Buffer("warmstart_out", model.nv, output=True),
+        Buffer("finger_force", 3 * scene.hand.num_fingers, output=True),
+        Buffer("stats", 4, output=True),
     ]
 
 
@@ -146,6 +141,7 @@ class Links:
         """Hinges of the hand, which is also the link of the object."""
         return len(self.parent)
 
+    @functools.cached_property
     def chains(self) -> list[list[int]]:
         """The hinges that carry each link, from the palm on."""
         chains: list[list[int]] = []
@@ -219,18 +215,16 @@ def kernel_constants(scene: PhysicsScene) -> str:
       AssetError: the kernel cannot run the scene.
     """
     check_scene(scene)
-    links, contacts = find_links(scene), _find_contacts(scene)
+    links = find_links(scene)
     return "\n".join(
         [
             *_sizes(scene, links),
-            *_tree(links, scene),
             *_bodies(scene, links),
             *_joints(scene),
             *_couplings(scene.model),
             *_pairs(scene, links),
             '#include "contacts/geoms.cuh"',
-            *_contact_sizes(scene, contacts),
-            *_contact_rows(scene, contacts, links),
+            *_contacts(scene, links),
             "",
         ]
     )
@@ -255,10 +249,14 @@ def _number(value: float) -> str:
 
 
 def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
-    option, blocks = scene.model.opt, _blocks(scene, links)
+    """Numbers of the scene and its tree of links."""
+    option, chains, steps, blocks = scene.model.opt, links.chains, links.gathering(), _blocks(scene, links)
+    first = last = np.zeros(links.hinges, int)
+    if blocks is not None:
+        first, last = np.searchsorted(blocks, blocks), np.searchsorted(blocks, blocks, side="right") - 1
     sizes = {
         "HINGES": links.hinges,
-        "CHAIN": max(map(len, links.chains())),
+        "CHAIN": max(map(len, chains)),
         # Hinges of a finger if every finger is one chain of few; 0: the hand is eliminated as a whole.
         "BLOCK": 0 if blocks is None else int(np.bincount(blocks).max()),
         "PRIMITIVES": len(scene.slots),
@@ -267,32 +265,19 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
         "FINGERS": scene.hand.num_fingers,
         "MAX_CONTACTS": MAX_CONTACTS,
     }
-    numbers = {
-        "TIMESTEP": option.timestep,
-        "IMPRATIO": option.impratio,
-        "GRAVITY_X": option.gravity[0],
-        "GRAVITY_Y": option.gravity[1],
-        "GRAVITY_Z": option.gravity[2],
-    }
+    numbers = {"TIMESTEP": option.timestep, "IMPRATIO": option.impratio}
+    numbers |= {f"GRAVITY_{axis}": value for axis, value in zip("XYZ", option.gravity, strict=True)}
     return [
         *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
         *(f"constexpr float {name} = {_number(value)};" for name, value in numbers.items()),
-    ]
-
-
-def _tree(links: Links, scene: PhysicsScene) -> list[str]:
-    steps, blocks = links.gathering(), _blocks(scene, links)
-    first = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks)
-    last = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks, side="right") - 1
-    return [
         _array("PARENT", _lanes(links.parent, -1), "int"),
-        _array("DEPTH", _lanes([len(chain) - 1 for chain in links.chains()]), "int"),
+        _array("DEPTH", _lanes([len(chain) - 1 for chain in chains]), "int"),
         _array("BLOCK_FIRST", _lanes(first), "int"),
         _array("BLOCK_LAST", _lanes(last), "int"),
         f"constexpr int GATHER_STEPS = {len(steps)};",
         _array("GATHER_FROM", np.array([_lanes(step, -1) for step in steps] or [_lanes([], -1)]), "int"),
-        _array("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in links.chains()), 0], "int"),
-        _array("CHAIN_HINGE", _padded(links.chains()), "int"),
+        _array("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in chains), 0], "int"),
+        _array("CHAIN_HINGE", [chain + [-1] * (sizes["CHAIN"] - len(chain)) for chain in chains], "int"),
     ]
 
 
@@ -390,7 +375,7 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
 
 def _blocks(scene: PhysicsScene, links: Links) -> np.ndarray | None:
     """The finger [H] of each hinge if each is one chain of few; None where the hand has to be taken as a whole."""
-    chains = links.chains()
+    chains = links.chains
     finger = np.array([chain[0] for chain in chains])
     model = scene.model
     coupled = [(first, second) for first, second in zip(model.eq_obj1id, model.eq_obj2id, strict=True) if second >= 0]
@@ -399,11 +384,6 @@ def _blocks(scene: PhysicsScene, links: Links) -> np.ndarray | None:
     if across or branched or max(map(len, chains)) > _FAST:
         return None
     return finger
-
-
-def _padded(rows: list[list[int]]) -> np.ndarray:
-    width = max(map(len, rows))
-    return np.array([row + [-1] * (width - len(row)) for row in rows])
 
 
 def _lanes(values: ArrayLike, fill: float = 0.0) -> np.ndarray:
@@ -421,25 +401,26 @@ def _spread(centre: np.ndarray) -> np.ndarray:
     return np.dot(centre, centre) * np.eye(3) - np.outer(centre, centre)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Contacts:
-    """The pairs of a scene, of the hand and the object and within the hand."""
-
-    geoms: dict[str, list[int]]  # of the hand that may touch the object, by kind
-    others: list[int]  # spheres and capsules that only touch the hand
-    object_pair: np.ndarray  # [K, G] pair of a primitive and each of `geoms` in order
-    round_pairs: list[tuple[int, int, int]]  # geom, geom or -1 - primitive, pair
-
-
 def _kind(scene: PhysicsScene, geom: int) -> str:
     return mujoco.mjtGeom(scene.model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
 
 
-def _find_contacts(scene: PhysicsScene) -> _Contacts:
+def _sort_pairs(
+    scene: PhysicsScene,
+) -> tuple[dict[str, list[int]], list[int], np.ndarray, list[tuple[int, int, int]]]:
+    """The pairs of a scene, of the hand and the object and within the hand.
+
+    Returns:
+      The hand's geoms that may touch the object, by kind; spheres and capsules that only touch the hand; the pair
+      [K, G] of a primitive and each of the former in order; pairs of round geoms: geom, geom or -1 - primitive, pair.
+
+    Raises:
+      AssetError: the kernel has no contacts of two kinds.
+    """
     model = scene.model
     primitive = {int(geom): k for k, geom in enumerate(scene.object_geoms)}
     geoms: dict[str, list[int]] = {kind: [] for kind in ("sphere", "capsule", "box", "plane")}
-    pairs: dict[tuple[int, int], int] = {}
+    pairs: dict[tuple[int, int], int] = {}  # of a primitive and a geom
     hand: list[tuple[int, int, int]] = []
     lacking = []
     for pair, (first, second) in enumerate(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)):
@@ -465,18 +446,22 @@ def _find_contacts(scene: PhysicsScene) -> _Contacts:
         if scene.slots[k] == "capsule" and geom in geoms["capsule"]
     ]
     others = sorted({geom for *both, _ in hand for geom in both} - set(geoms["sphere"]) - set(geoms["capsule"]))
-    return _Contacts(geoms, others, object_pair, capsules + hand)
+    return geoms, others, object_pair, capsules + hand
 
 
-def _contact_sizes(scene: PhysicsScene, contacts: _Contacts) -> list[str]:
-    counts = {kind: len(geoms) for kind, geoms in contacts.geoms.items()}
+def _contacts(scene: PhysicsScene, links: Links) -> list[str]:
+    """What contacts are found between: geoms, pairs and their numbers."""
+    model = scene.model
+    geoms, others, object_pair, round_pairs = _sort_pairs(scene)
+    round_geoms = [*geoms["sphere"], *geoms["capsule"], *others]
+    counts = {kind: len(rows) for kind, rows in geoms.items()}
     sizes = {
         "SPHERES": counts["sphere"],
         "CAPSULES": counts["capsule"],
         "BOXES": counts["box"],
         "FIRST_BOX_GEOM": counts["sphere"] + counts["capsule"],
         "FIRST_PLANE_GEOM": counts["sphere"] + counts["capsule"] + counts["box"],
-        "ROUND_PAIRS": len(contacts.round_pairs),
+        "ROUND_PAIRS": len(round_pairs),
         "PLANE_POINTS": counts["plane"] * sum(_PLANE_POINTS[kind] for kind in scene.slots),
     }
     for kind in _PRIMITIVES:
@@ -484,11 +469,6 @@ def _contact_sizes(scene: PhysicsScene, contacts: _Contacts) -> list[str]:
         sizes[f"FIRST_{kind.upper()}"] = scene.slots.index(kind) if kind in scene.slots else 0
     # Fingers touch several boxes of a mesh at once: the deepest contacts are chosen.
     sizes["EXTRA_CONTACTS"] = _EXTRA if scene.slots.count("box") > 1 else 0
-    return [f"constexpr int {name} = {value};" for name, value in sizes.items()]
-
-
-def _contact_rows(scene: PhysicsScene, contacts: _Contacts, links: Links) -> list[str]:
-    model = scene.model
     sized = {int(geom): len(scene.slots) + k for k, geom in enumerate(scene.tip_geoms)}
 
     def place(geom: int) -> tuple[str, int, np.ndarray]:
@@ -498,22 +478,21 @@ def _contact_rows(scene: PhysicsScene, contacts: _Contacts, links: Links) -> lis
         link = links.link[body] if links.link[body] >= 0 else links.hinges
         return _list(centre), int(link), links.rotation[body] @ rotation_matrix(model.geom_quat[geom])
 
-    round_geoms = [*contacts.geoms["sphere"], *contacts.geoms["capsule"], *contacts.others]
     round_rows, box_rows, plane_rows = [], [], []
     for geom in round_geoms:
         at, link, turn = place(geom)
         half = model.geom_size[geom, 1] if _kind(scene, geom) == "capsule" else 0.0
         radius = _number(model.geom_size[geom, 0])
         round_rows.append(f"{at}, {link}, {_list(half * turn[:, 2])}, {radius}, {sized.get(geom, -1)}")
-    for geom in contacts.geoms["box"]:
+    for geom in geoms["box"]:
         at, link, turn = place(geom)
         axes = ", ".join(_list(row) for row in turn)
         box_rows.append(f"{at}, {link}, {{{axes}}}, {_list(model.geom_size[geom])}, {sized.get(geom, -1)}")
-    for geom in contacts.geoms["plane"]:
+    for geom in geoms["plane"]:
         at, _, turn = place(geom)
         plane_rows.append(f"{at}, {_list(turn[:, 2])}")
     index = {geom: k for k, geom in enumerate(round_geoms)}
-    pairs = [f"{index[one]}, {index.get(two, two)}, {pair}" for one, two, pair in contacts.round_pairs]
+    pair_rows = [f"{index[one]}, {index.get(two, two)}, {pair}" for one, two, pair in round_pairs]
     points = [
         f"{plane}, {k}, {_PRIMITIVES.index(kind)}, {corner}"
         for plane in range(len(plane_rows))
@@ -521,12 +500,13 @@ def _contact_rows(scene: PhysicsScene, contacts: _Contacts, links: Links) -> lis
         for corner in range(_PLANE_POINTS[kind])
     ]
     return [
+        *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
         *_table("RoundGeom", "ROUND_GEOM", round_rows),
         *_table("BoxGeom", "BOX_GEOM", box_rows),
         *_table("PlaneGeom", "PLANE_GEOM", plane_rows),
-        *_table("RoundPair", "ROUND_PAIR", pairs),
+        *_table("RoundPair", "ROUND_PAIR", pair_rows),
         *_table("PlanePoint", "PLANE_POINT", points),
-        _array("OBJECT_PAIR", contacts.object_pair, "int"),
+        _array("OBJECT_PAIR", object_pair, "int"),
     ]
 
 

@@ -31,18 +31,14 @@ class GraspReward(Config):
     """Reward when the object is lost, paid once."""
     sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
     """Width of the narrow Gaussian, in units of the maximum force or torque (the paper's value)."""
-    tail_sigma: float = setting(0.40, unit="1", low=0.001, high=10.0)
-    """Width of the wide Gaussian, which gives a gradient far from the target."""
     tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
-    """Share of the wide Gaussian in the reward."""
+    """Share in the reward of a wide Gaussian, which gives a gradient far from the target."""
     overload: float = setting(-0.5, unit="1", low=-1000.0, high=0.0)
-    """Weight of the four fingers' force beyond `margin` above their target, divided by `max_force`. The Gaussians are
+    """Weight of the four fingers' force more than 1 N above their target, divided by `max_force`. The Gaussians are
     flat there: a finger that carries an object nearly alone gains nothing by relaxing a little."""
-    margin: float = setting(1.0, unit="N", low=0.0, high=100.0)
-    """Force above the target that `overload` does not count."""
-    thumb: str = setting("loose", choices=("loose", "track", "binary"))
+    thumb: str = setting("loose", choices=("loose", "binary"))
     """Force term of the thumb, which opposes all other fingers and needs more force than each of them. loose: the wide
-    Gaussian only; track: as for the fingers; binary: the paper's, any force within the bounds."""
+    Gaussian only; binary: the paper's, any force within the bounds."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,10 +56,6 @@ class GraspConfig(EnvConfig):
     """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose with four fingers."""
     max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
     """Force that forces are normalised by."""
-    force_per_torque: float = setting(19.0, unit="N/Nm", low=1.0, high=200.0)
-    """Finger force per root-joint torque; ties the torque target to the force target."""
-    command_change: float = setting(0.005, unit="1", low=0.0, high=1.0)
-    """Probability per tick that a new command is sampled within an episode."""
     push_probability: float = setting(0.015, unit="1", low=0.0, high=1.0)
     """Probability per tick of a push on the object."""
     push_speed: float = setting(0.3, unit="m/s", low=0.0, high=5.0)
@@ -72,30 +64,18 @@ class GraspConfig(EnvConfig):
     """The object is lost when its centre is farther than this from the grasp centre."""
     posture: tuple[float, ...] = setting((), unit="rad", low=-3.2, high=3.2)
     """Joint angles that episodes start near; empty for those that the hand's TOML gives."""
-    posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
-    """Largest deviation of the start posture from `posture`, per joint."""
     curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
     """Range added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Range of the gap between palm and object at release."""
-    release_speed: tuple[float, float] = setting((0.0, 0.1), unit="m/s", low=0.0, high=3.0)
-    """Range of the object's speed away from the palm at release."""
-    release_drift: float = setting(0.05, unit="m/s", low=0.0, high=3.0)
-    """Largest speed along the palm, in each direction, at release."""
-    release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
-    """Largest spin about each of the object's axes at release."""
     release_delay: tuple[float, float] = setting((0.1, 0.5), unit="s", low=0.0, high=2.0)
     """Range of the time for which somebody still holds the object after the fingers have begun to move."""
-    place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
-    """Largest shift of the object along the palm, in each direction."""
-    turn_noise: tuple[float, float] = setting((0.6, 0.3), unit="rad", low=0.0, high=3.2)
-    """Largest turn of the object about the palm's normal, and its largest tilt; its roll is free."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, "finger_force", "curl", "release_gap", "release_speed", "release_delay")
+        check_ranges(self, "finger_force", "curl", "release_gap", "release_delay")
 
 
 def paper() -> GraspConfig:

@@ -1,5 +1,7 @@
 """The grasp task's evaluation report: catch rate, hold time, commanded against measured force."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from dexsim.core.statistics import bootstrap, entry, mean, proportion, statistic
@@ -38,17 +40,14 @@ def summarize(
       shapes: names of what the metric "shape" counts.
 
     Returns:
-      A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
-      shorter episodes) to the end, for episodes held to the end. "finger_..." are means over the touching fingers but
-      the thumb, of which the command speaks; "total_force" is the solver's force summed over all fingers,
-      "taxel_force" that sum as the taxels feel it.
-      "r_resultant", "r_normal" and "r_taxels" correlate command and commanded force, see `FORCES`.
-      "total_torque" is the sum over touching fingers of the root joint's torque as a share of its limit; "r_torque"
-      correlates it with the command. "slope_torque" and "slope_force_n" are least-squares slopes over the command, of
-      it and of the commanded force.
-      "torque_limited" is the share of these ticks with a joint at its torque limit: there force cannot follow.
-      "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not pressed.
-      Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
+      A JSON-able dict. Forces are averaged over the ticks of "window_s", for episodes held to the end. "finger_..." are
+      means over the touching fingers but the thumb, of which the command speaks; "total_force" is the solver's force
+      summed over all fingers, "taxel_force" that sum as the taxels feel it. "total_torque" is the sum over touching
+      fingers of the root joint's torque as a share of its limit, "torque_limited" the share of ticks with a joint at
+      its limit: there force cannot follow. "r_..." correlate the command with the commanded force (`FORCES`) and the
+      torque, "slope_..." are least-squares slopes over it. "force_error_n" is the root mean square error of the
+      resultant over all episodes; a lost object is not pressed. Intervals are 95 %: Wilson's for proportions, else
+      bootstrap over episodes.
     """
     ticks, episodes = alive.shape
     held, command, shape = alive[-1], metrics["command"][0], metrics["shape"][0].astype(int)
@@ -148,10 +147,7 @@ def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
         a, b = x[rows], y[rows]
         return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else np.nan
 
-    if x.size < 3 or x.std() == 0 or y.std() == 0:
-        return {"r": None, "low": None, "high": None}
-    low, high = bootstrap(correlate, x.size, samples) if samples else (None, None)
-    return {"r": correlate(slice(None)), "low": low, "high": high}
+    return _interval("r", correlate, x.size, samples, x.size >= 3 and x.std() > 0 and y.std() > 0)
 
 
 def slope(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
@@ -161,7 +157,11 @@ def slope(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
         off = x[rows] - x[rows].mean()
         return float(off @ y[rows] / (off @ off)) if off.any() else np.nan
 
-    if x.size < 3 or x.std() == 0:
-        return {"mean": None, "low": None, "high": None}
-    low, high = bootstrap(fit, x.size, samples)
-    return {"mean": fit(slice(None)), "low": low, "high": high}
+    return _interval("mean", fit, x.size, samples, x.size >= 3 and x.std() > 0)
+
+
+def _interval(name: str, function: Callable, count: int, samples: int, defined: bool) -> dict:
+    if not defined:
+        return {name: None, "low": None, "high": None}
+    low, high = bootstrap(function, count, samples) if samples else (None, None)
+    return {name: function(slice(None)), "low": low, "high": high}

@@ -29,13 +29,20 @@ from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
-from dexsim.tasks.placement import clearance, palm_height
+from dexsim.tasks.placement import clearance, close_fingers, palm_height
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
 _CONTACT = 0.01  # N, force from which a finger counts as touching
+_TAIL_SIGMA = 0.40  # width of the wide Gaussian, in units of the maximum force or torque
+_FORCE_PER_TORQUE = 19.0  # N/Nm, of the root joint; ties the torque target to the force target
+_MARGIN = 1.0  # N above the target that is no overload
+_COMMAND_CHANGE = 0.005  # probability per tick that a new command is sampled within an episode
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
+# Largest deviations of start states: of a joint from the posture, rad; of the object along the palm, in each direction,
+# m; its turn about the palm's normal and its tilt, rad. Its roll is free.
+_POSTURE_NOISE, _PLACE_NOISE, _TURN_NOISE, _TILT_NOISE = 0.12, 0.012, 0.6, 0.3
 
 
 @pytree_dataclass
@@ -47,10 +54,10 @@ class GraspGoal:
     delay: jax.Array | None = None  # [] s until the object is let go
 
 
-def tailed_gaussian(error: jax.Array, sigma: float, tail_sigma: float, tail: float) -> jax.Array:
-    """(1 - tail) exp(-e^2 / 2 sigma^2) + tail exp(-e^2 / 2 tail_sigma^2)."""
+def tailed_gaussian(error: jax.Array, sigma: float, tail: float) -> jax.Array:
+    """(1 - tail) exp(-e^2 / 2 sigma^2) + tail exp(-e^2 / 2 0.4^2)."""
     narrow = jnp.exp(-0.5 * (error / sigma) ** 2)
-    wide = jnp.exp(-0.5 * (error / tail_sigma) ** 2)
+    wide = jnp.exp(-0.5 * (error / _TAIL_SIGMA) ** 2)
     return (1 - tail) * narrow + tail * wide
 
 
@@ -62,19 +69,10 @@ def command_reward(
     R_force and R_torque of the paper: zero outside `bounds` and without contact. The first
     finger is the thumb; see `GraspReward.thumb`.
     """
-    valid = contact & (value >= bounds[0]) & (value <= bounds[1])
-    match = tailed_gaussian((value - goal) / scale, weights.sigma, weights.tail_sigma, weights.tail)
-    if weights.thumb == "binary":
-        match = match.at[0].set(1.0)
-    elif weights.thumb == "loose":
-        loose = tailed_gaussian((value - goal) / scale, 1.0, weights.tail_sigma, 1.0)
-        match = match.at[0].set(loose[0])
-    return jnp.sum(jnp.where(valid, match, 0.0)) / value.shape[0]
-
-
-def overload(force: jax.Array, limit: jax.Array) -> jax.Array:
-    """Forces [F] N beyond a limit [] N, summed."""
-    return jnp.sum(jnp.maximum(force - limit, 0.0))
+    valid, error = contact & (value >= bounds[0]) & (value <= bounds[1]), (value - goal) / scale
+    match = tailed_gaussian(error, weights.sigma, weights.tail)
+    thumb = tailed_gaussian(error, 1.0, 1.0)[0] if weights.thumb == "loose" else 1.0
+    return jnp.sum(jnp.where(valid, match.at[0].set(thumb), 0.0)) / value.shape[0]
 
 
 def joint_spread(first_joints: jax.Array) -> jax.Array:
@@ -103,10 +101,6 @@ class Grasp(Task):
         if not hand.grasp_centre or not (config.posture or hand.grasp_posture):
             raise ConfigError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
         config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture)
-        if len(config.posture) != hand.num_joints:
-            raise ConfigError(
-                f"GraspConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
-            )
         x, y, z = hand.grasp_centre
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, config.finger_force
@@ -159,52 +153,36 @@ class Grasp(Task):
     def _candidate(self, key: jax.Array, shape_index: jax.Array) -> tuple[Start, jax.Array]:
         """A start state with an object of this shape, and whether [] the hand is clear of it."""
         hand, config, reference = self.hand, self.config, self.reference
-        keys = jax.random.split(key, 7)
+        keys, sides = jax.random.split(key, 7), (-1.0, 1.0)  # the sixth is free
         object = self.sample_object(keys[0], config, shape_index)
-        sides = (-1.0, 1.0)
-        drawn = uniforms(
-            jnp.concatenate([keys[1:], jax.vmap(jax.random.fold_in, (None, 0))(keys[5], jnp.array([1, 2]))]),
-            (sides, sides, config.release_gap, sides, config.release_speed, config.curl, sides, sides),
-            None,
-            (max(hand.num_joints, 3),),
-        )
-        noise = config.posture_noise * drawn[0, : hand.num_joints]
-        (roll, turn, askew), shift = drawn[1, :3], config.place_noise * drawn[3, :2]
-        gap, speed, curl = drawn[2, 0], drawn[4, 0], drawn[5, 0]
-        drift, spin = config.release_drift * drawn[6, :2], config.release_spin * drawn[7, :3]
-        flexion = np.zeros(hand.num_joints, np.float32)
-        flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
-        joints = jnp.asarray(config.posture) + noise + curl * flexion
+        spans = sides, sides, config.release_gap, sides, config.curl
+        drawn = uniforms(keys[np.array([1, 2, 3, 4, 6])], spans, None, (max(hand.num_joints, 3),))
+        noise = _POSTURE_NOISE * drawn[0, : hand.num_joints]
+        (roll, turn, askew), shift = drawn[1, :3], _PLACE_NOISE * drawn[3, :2]
+        gap, curl = drawn[2, 0], drawn[4, 0]
+        joints = jnp.asarray(config.posture) + noise + curl * close_fingers(hand, range(1, hand.num_fingers))
         joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
 
         # Long objects lie across the fingers (their z along the palm's y, either way), turned about the palm's normal
         # and a little askew; the roll about their own axis is free.
         quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
-        most = config.turn_noise
         for axis, angle in (
             ((1.0, 0.0, 0.0), jnp.where(drawn[3, 2] < 0.0, -0.5, 0.5) * jnp.pi),
-            ((0.0, 0.0, 1.0), most[1] * askew),
-            ((1.0, 0.0, 0.0), most[0] * turn),
+            ((0.0, 0.0, 1.0), _TILT_NOISE * askew),
+            ((1.0, 0.0, 0.0), _TURN_NOISE * turn),
         ):
             quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
         matrix = rotations.quat_to_matrix(quat)
         # How far the object reaches [6] along the palm's axes, in both directions. Its middle, not its origin, is put
         # where the fingers meet: that of a composition is in its body, beside which the neck juts out.
-        reach = jax.vmap(
-            lambda way: extent(
-                object.size,
-                object.position,
-                object.active,
-                rotations.rotate_inverse(matrix, way),
-                object.kinds,
-                object.quat,
-            )
-        )(jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
+        parts = object.size, object.position, object.active
+        reach = jax.vmap(lambda way: extent(*parts, rotations.rotate_inverse(matrix, way), object.kinds, object.quat))(
+            jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
+        )
         middle = (reach[1:3] - reach[4:]) / 2
         position = jnp.stack([palm_height(hand) + gap + reach[3], *(jnp.asarray(reference[1:]) + shift - middle)])
         qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
-        qvel = jnp.concatenate([jnp.zeros(hand.num_hinges), speed[None], drift, spin])
-        start = Start(qpos=qpos, qvel=qvel, object=object)
+        start = Start(qpos=qpos, qvel=jnp.zeros(hand.num_hinges + 6), object=object)
         return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP
 
     @property
@@ -223,7 +201,7 @@ class Grasp(Task):
     def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
         del truth
         when, what = jax.random.split(key)
-        change = jax.random.bernoulli(when, self.config.command_change) & ~goal.fixed
+        change = jax.random.bernoulli(when, _COMMAND_CHANGE) & ~goal.fixed
         return dataclasses.replace(
             goal,
             command=jnp.where(change, jax.random.uniform(what), goal.command),
@@ -240,14 +218,8 @@ class Grasp(Task):
         return target_force(goal.command, self.config.finger_force)
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        return random_push(
-            key,
-            object.mass,
-            probability=self.config.push_probability,
-            speed=self.config.push_speed,
-            period=self.config.physics.control_period,
-        )
+        chance, speed = self.config.push_probability, self.config.push_speed
+        return random_push(key, object.mass, probability=chance, speed=speed, period=self.config.physics.control_period)
 
     def dropped(self, goal: GraspGoal, truth: GroundTruth) -> jax.Array:
         del goal
@@ -263,23 +235,16 @@ class Grasp(Task):
         torque = truth.joint_torque[self._roots] * self._closing
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
-        fingers = self._finger_joints
+        fingers, too_much = self._finger_joints, jnp.maximum(force[1:] - (target + _MARGIN), 0.0)
+        share, wanted = torque / self._max_torque, target / _FORCE_PER_TORQUE / self._max_torque
+        pulling = contact & (torque >= 0.01)
+        follows_force = command_reward(force, target, contact, (0.01, 200.0), config.max_force, weights)
+        follows_torque = command_reward(share, wanted, pulling, (0.0, 1.0), 1.0, weights)
         terms = {
-            "force": held
-            * weights.force
-            * command_reward(force, target, contact, (0.01, 200.0), config.max_force, weights),
-            "torque": held
-            * weights.torque
-            * command_reward(
-                torque / self._max_torque,
-                target / config.force_per_torque / self._max_torque,
-                contact & (torque >= 0.01),
-                (0.0, 1.0),
-                1.0,
-                weights,
-            ),
+            "force": held * weights.force * follows_force,
+            "torque": held * weights.torque * follows_torque,
             "alive": held * weights.alive,
-            "overload": held * weights.overload * overload(force[1:], target + weights.margin) / config.max_force,
+            "overload": held * weights.overload * jnp.sum(too_much) / config.max_force,
             "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),

@@ -10,7 +10,6 @@ from dexsim.env.config import EnvConfig
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.task_spec import TurnSpec
-from dexsim.tasks.rotate.objects import KINDS
 from dexsim.touch.skin import Skin
 
 
@@ -19,22 +18,15 @@ class RotateReward(Config):
     """Weights of the reward terms, per control tick."""
 
     goal: float = setting(0.2, unit="rad", low=0.0, high=1000.0)
-    """Weight of 1 / (d_rot + `epsilon`), the closeness to the goal, gated by the distance from the reference. The
+    """Weight of 1 / (d_rot + 0.1), the closeness to the goal, gated by the distance from the reference. The
     paper's weight, 1, rewards holding still at the end of a stroke."""
-    epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
-    """Constant added to the angle d_rot."""
     gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
     """Distance from the reference at which the gate is half closed."""
-    gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
-    """Slope of the gate."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
     """Reward for each goal reached, before `bonus_tips` and `bonus_speed` reduce it."""
     bonus_tips: float = setting(0.8, unit="1", low=0.0, high=1.0)
-    """Share of the bonus that depends on `working_tips` fingertips taking part; a hand cannot earn it by standing
-    still."""
-    tips_after: int = setting(2, unit="1", low=0, high=1000)
-    """Goals in an episode after which `bonus_tips` counts. From the first goal on it would teach policies that have
-    found one stroke to clamp the object with all fingers."""
+    """Share of the bonus that depends on three fingertips taking part, from the third goal of an episode on; a hand
+    cannot earn it by standing still."""
     bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
     """Recent joint speed (mean of all joints) beyond which the bonus falls with the square of the speed."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
@@ -46,11 +38,6 @@ class RotateReward(Config):
     spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
     """Weight of the spin about the axis toward the goal, up to +-1 rad/s. It gives a gradient before the first
     goal is ever reached."""
-    working_tips: int = setting(3, unit="1", low=1, high=20)
-    """Fingertips that should take part. The least busy of them counts: with their mean, two busy fingertips would earn
-    most of the bonus, and some seeds use only two."""
-    working_duty: float = setting(0.12, unit="1", low=0.001, high=1.0)
-    """Share of the time for which a fingertip must touch to count fully."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Reward when the object is lost, paid once."""
 
@@ -68,11 +55,8 @@ class RotateConfig(EnvConfig):
     than fingertips: with more, random strokes carry the object over the thumb."""
     control: Control = setting(Control(step=0.08, last_action_encoding="target"))
     """From action to joint target."""
-    object: str = setting("cube", choices=(*KINDS, "mesh"))
-    """Object to rotate: a cube, an upright cylinder, an eight-cornered union of two boxes (octagon), or the mesh of
-    `objects.mesh`."""
     edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
-    """Range of the edge of the cube; of width and height for the other objects."""
+    """Range of the edge of the cube that is turned, where `objects` has no mesh."""
     turn: TurnSpec = setting(TurnSpec(spin=2.0))
     """Goals that follow one another about an axis, and when each is reached."""
     support: str = setting("palm", choices=("palm", "fingers"))
@@ -96,8 +80,6 @@ class RotateConfig(EnvConfig):
     drop_radius: float = setting(0.055, unit="m", low=0.01, high=1.0)
     """A training episode ends as a drop when the object is farther than this from the reference. Without this limit
     some policies learn gaits that lose the object over the palm's edge. Evaluations use `drop_distance`."""
-    clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
-    """Smallest gap between palm and object with support "fingers"."""
     episode_seconds: float = setting(20.0, unit="s", low=0.2, high=3600.0)
     """Training episode length. It is short, as most objects are lost in the first strokes."""
     evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
@@ -115,8 +97,6 @@ class RotateConfig(EnvConfig):
     """Range added to all joints of the four fingers alike."""
     squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
     """Range of the distance between joint targets and start posture of thumb and fingers: the grip."""
-    heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
-    """Largest turn of the object about the axis at the start."""
     start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
     """Start position of the object, across and along the palm (y, z) from the reference: a little away from thumb and
     fingertips, beside which the first stroke often fails."""
@@ -125,8 +105,6 @@ class RotateConfig(EnvConfig):
     trap: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of the start states in which the object is stuck: ahead of the reference, tipped toward the wrist and held
     by the middle finger. Above 0, tipping and moving ahead cost in every tick, too."""
-    settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
-    """Time for start states to come to rest; states that do not are discarded."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
     """Reward weights. The gate closes before `turn.distance`."""
 
@@ -135,11 +113,6 @@ class RotateConfig(EnvConfig):
         check_ranges(self, "edge", "curl", "squeeze")
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
-        if (self.object == "mesh") != bool(self.objects.mesh):
-            raise ConfigError(
-                f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
-                "a mesh needs object 'mesh' and the name of its file"
-            )
 
 
 def paper() -> RotateConfig:

@@ -1,7 +1,7 @@
 """Start states of the rotation task: objects that came to rest in random postures of the hand.
 
-Settling runs in C MuJoCo on the host's cores, once: it needs no compilation, and the pool is kept on
-disk under the hash of the hand's files and the configuration. Training never waits for it again.
+Settling runs in C MuJoCo on the host's cores, once: the pool is kept on disk under the hash of the hand's files and the
+configuration.
 """
 
 import contextlib
@@ -12,7 +12,6 @@ import json
 import os
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,21 +23,24 @@ from dexsim.core.assets import cache_path
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_whole
+from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
 from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
 from dexsim.physics.model import build_scene, tip_bodies
-from dexsim.tasks.placement import clearance, palm_height
-from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_turned_object, slots
+from dexsim.tasks.placement import clearance, close_fingers, palm_height
+from dexsim.tasks.rotate.objects import CLEARANCE, largest_size, lowest_point, sample_turned_object, slots
 
 _TRIALS = 300  # rounds of candidates in which every object should find a posture
 _VERSION = 4  # of the procedure: raise it when older pools no longer hold
+_SETTLING = 0.8  # s, for start states to come to rest; those that do not are discarded
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
+_HEADING_NOISE = 0.7  # rad, largest turn of the object about the axis at the start
 _LEVEL = 0.35  # rad, largest angle from upright
 _UNUSED = (
-    *("reward", "sensing", "observation", "skin", "control", "touch", "randomization", "turn"),
+    *("reward", "sensing", "observation", "skin", "control", "randomization", "turn"),
     *("episode_seconds", "evaluation_seconds", "push_probability", "push_speed"),
 )
 """Settings that no start state depends on; what does of `turn` and `randomization` is named in `_fingerprint`."""
@@ -52,13 +54,12 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
     Raises:
       ConfigError: next to nothing stays in the hand.
     """
-    from dexsim.env.state import Start
-
     path = cache_path("pools") / f"rotate-{_fingerprint(key, hand, config)}.npz"
-    template = jax.eval_shape(lambda: sample_turned_object(key, config))
-    leaves, structure = jax.tree.flatten(template)
-    stored = _read(path, len(leaves))
-    if stored is None:
+    leaves, structure = jax.tree.flatten(jax.eval_shape(lambda: sample_turned_object(key, config)))
+    try:
+        with np.load(path) as file:
+            stored = [file[f"a{i}"] for i in range(len(leaves) + 3)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # missing, damaged, of another layout
         stored = _make(key, hand, config, gravity, config.pool_size)
         trapped = round(config.trap * config.pool_size)
         if trapped:
@@ -67,10 +68,12 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
                 np.concatenate([rows[trapped:], np.resize(more, (trapped, *more.shape[1:]))])
                 for rows, more in zip(stored, few, strict=True)
             ]
-        _write(path, stored)
+        buffer = io.BytesIO()
+        np.savez(buffer, **{f"a{i}": rows for i, rows in enumerate(stored)})
+        with contextlib.suppress(OSError):  # a disk without room or rights
+            write_whole(path, [buffer.getbuffer()])
     qpos, qvel, joint_target, *rows = stored
-    object = jax.tree.unflatten(structure, rows)
-    return Start(qpos=qpos, qvel=qvel, object=object, joint_target=joint_target)
+    return Start(qpos=qpos, qvel=qvel, object=jax.tree.unflatten(structure, rows), joint_target=joint_target)
 
 
 def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
@@ -82,28 +85,10 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     digest.update(hand.model_path.read_bytes() + hand.digest.encode())
     digest.update(np.asarray(jax.random.key_data(key)).tobytes())
     digest.update(f"{_VERSION} {mujoco.__version__}".encode())
-    if config.object == "mesh":
+    if config.objects.mesh:
         boxes = load_mesh_object(config.objects).boxes
         digest.update(b"".join(part.tobytes() for part in (boxes.size, boxes.position, boxes.quat)))
     return digest.hexdigest()[:16]
-
-
-def _read(path: Path, count: int) -> list[Any] | None:
-    """The arrays of a pool file; None if it is missing, damaged or of another layout."""
-    try:
-        with np.load(path) as file:
-            return [file[f"a{i}"] for i in range(count + 3)]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-
-
-def _write(path: Path, arrays: list[np.ndarray]) -> None:
-    """Keep the arrays; a cache that cannot be written is no error."""
-    buffer = io.BytesIO()
-    named: dict[str, Any] = {f"a{i}": a for i, a in enumerate(arrays)}
-    np.savez(buffer, **named)
-    with contextlib.suppress(OSError):
-        write_whole(path, [buffer.getbuffer()])
 
 
 def _make(
@@ -116,9 +101,8 @@ def _make(
     """
     chunk, threads = 1024, min(os.cpu_count() or 1, 16)
     object_key, key = jax.random.split(key)
-    objects = jax.device_get(
-        jax.jit(jax.vmap(lambda k: sample_turned_object(k, config)))(jax.random.split(object_key, size))
-    )
+    draw = jax.jit(jax.vmap(lambda k: sample_turned_object(k, config)))
+    objects = jax.device_get(draw(jax.random.split(object_key, size)))
     candidate = _trap_candidate if trap else _candidate
     sample = jax.jit(jax.vmap(lambda k, object: candidate(k, object, hand, config)))
     starts, waiting, tried = {}, np.arange(size), 0
@@ -126,12 +110,8 @@ def _make(
         models = [_model(hand, config, gravity) for _ in range(threads)]
         for trial in range(_TRIALS):
             which = np.resize(waiting, chunk)
-            candidates = jax.device_get(
-                sample(
-                    jax.random.split(jax.random.fold_in(key, trial), chunk),
-                    jax.tree.map(lambda leaf, which=which: leaf[which], objects),
-                )
-            )
+            keys = jax.random.split(jax.random.fold_in(key, trial), chunk)
+            candidates = jax.device_get(sample(keys, jax.tree.map(lambda leaf, which=which: leaf[which], objects)))
             rows = np.flatnonzero(candidates["clear"])
             rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
             settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates, trap=trap)
@@ -161,11 +141,10 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
     """This object just above where it will rest, in a random posture."""
     keys = jax.random.split(key, 5)
     noise = config.posture_noise * jax.random.uniform(keys[0], (hand.num_joints,), minval=-1.0)
-    flexion = np.zeros(hand.num_joints, np.float32)
-    flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
+    flexion = close_fingers(hand, range(1, hand.num_fingers))
     curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower, hand.joint_upper)
-    heading = config.heading_noise * jax.random.uniform(keys[1], minval=-1.0)
+    heading = _HEADING_NOISE * jax.random.uniform(keys[1], minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.asarray(config.turn.unit_axis), heading)
     shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
@@ -173,9 +152,7 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
         floor = palm_height(hand) + 0.001 - lowest_point(object, quat, jnp.zeros(3))
         place = place.at[0].set(floor)
     squeeze = jax.random.uniform(keys[4], minval=config.squeeze[0], maxval=config.squeeze[1])
-    closed = np.array(flexion)
-    closed[flexion_joints(hand, range(1))] = 1.0
-    target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
+    target = joints + squeeze * (flexion + close_fingers(hand, range(1)))
     return _at(hand, object, joints, target, place, quat)
 
 
@@ -183,24 +160,22 @@ def _trap_candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: An
     """This object where rotations get stuck: ahead of the reference, tipped toward the wrist, under the fingertip of
     the middle finger, which closes."""
     keys = jax.random.split(key, 6)
-    joints = jnp.asarray(config.posture) + config.posture_noise * jax.random.uniform(
-        keys[0], (hand.num_joints,), minval=-1.0
-    )
+    noise = config.posture_noise * jax.random.uniform(keys[0], (hand.num_joints,), minval=-1.0)
+    joints = jnp.asarray(config.posture) + noise
     middle = flexion_joints(hand, range(hand.num_fingers // 2, hand.num_fingers // 2 + 1))
-    joints = joints.at[middle].set(jax.random.uniform(keys[1], (len(middle),), minval=0.2, maxval=1.5))
-    joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
+    bent = jax.random.uniform(keys[1], (len(middle),), minval=0.2, maxval=1.5)
+    joints = jnp.clip(joints.at[middle].set(bent), hand.joint_lower, hand.joint_upper)
     target = joints.at[middle].add(jax.random.uniform(keys[2], minval=0.1, maxval=0.6))
-    heading = config.heading_noise * jax.random.uniform(keys[3], minval=-1.0)
+    heading = _HEADING_NOISE * jax.random.uniform(keys[3], minval=-1.0)
     pitch = jax.random.uniform(keys[4], minval=_TRAP_PITCH[0], maxval=_TRAP_PITCH[1])
     quat = rotations.quat_multiply(
         rotations.axis_angle_to_quat(jnp.array([0.0, 1.0, 0.0]), pitch),
         rotations.axis_angle_to_quat(jnp.asarray(config.turn.unit_axis), heading),
     )
-    shift = jax.random.uniform(
-        keys[5], (3,), minval=jnp.array([0.0, -0.025, 0.0]), maxval=jnp.array([0.03, 0.0, 0.015])
-    )
+    low, high = jnp.array([0.0, -0.025, 0.0]), jnp.array([0.03, 0.0, 0.015])
+    shift = jax.random.uniform(keys[5], (3,), minval=low, maxval=high)
     place = jnp.asarray(config.reference) + shift + jnp.array([0.0, 0.0, _TRAP_PLACE])
-    return _at(hand, object, joints, jnp.clip(target, hand.joint_lower, hand.joint_upper), place, quat)
+    return _at(hand, object, joints, target, place, quat)
 
 
 def _at(
@@ -209,7 +184,7 @@ def _at(
     overlap = clearance(hand, joints, object.shape(), place, rotations.quat_to_matrix(quat))
     return {
         "qpos": jnp.concatenate([hinge_angles(hand, joints), place, quat]),
-        "joint_target": target,
+        "joint_target": jnp.clip(target, hand.joint_lower, hand.joint_upper),
         "object": object,
         "clear": overlap > -0.001,
     }
@@ -237,7 +212,7 @@ def _settle(
     springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
     pairs = contact.pairs_with(model, np.array(geoms))
     rubber = contact.pair_constants(model, pairs, tip_bodies(model, hand))[2] >= 0
-    ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
+    ticks = max(round(_SETTLING / model.opt.timestep), 1)
     good, settled = [], []
     for row in rows:
         model.geom_size[geoms] = object.size[row]
@@ -263,7 +238,7 @@ def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarr
     if config.support == "palm" or not len(rows):
         return np.arange(len(rows))
     low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], object), qpos[:, -4:], qpos[:, -7:-4])
-    return np.flatnonzero(np.asarray(low) > palm_height(hand) + config.clearance)
+    return np.flatnonzero(np.asarray(low) > palm_height(hand) + CLEARANCE)
 
 
 def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData, trap: bool) -> bool:

@@ -22,16 +22,27 @@ from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand
 from dexsim.objects import params
-from dexsim.objects.config import BULK_RANGES, MESH_RANGES
+from dexsim.objects.config import BULK_RANGES, KINDS, MESH_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_turned_object, slots, unit_inertia
+from dexsim.tasks.rotate.objects import (
+    CLEARANCE,
+    cube_inertia,
+    largest_size,
+    lowest_point,
+    sample_turned_object,
+    slots,
+)
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import load_pool
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
+_EPSILON, _STEEPNESS = 0.1, 400.0  # rad and 1/m, of the paper's reward
+# Fingertips that should take part, and the share of the time for which one must touch to count fully. From the first
+# goal on, this teaches policies that have found one stroke to clamp the object with all fingers.
+WORKING_TIPS, WORKING_DUTY, _FROM_GOAL = 3, 0.12, 2
 _MEMORY = 2.0  # s, over which a fingertip's share of work and the joints' speed are averaged
 _RECENT = 0.2  # s, a fingertip that touched within this time before a drop pushed the object out
 
@@ -74,14 +85,17 @@ def goal_quat(turns: jax.Array | int, axis: jax.Array, angle: jax.Array | float)
 
 
 def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) -> jax.Array:
-    """1 / (|d_rot| + epsilon) / (1 + exp(400 (d_goal - 0.05)))."""
-    gate = jax.nn.sigmoid(weights.gate_steepness * (weights.gate - distance))
-    return gate / (jnp.abs(angle) + weights.epsilon)
+    """1 / (|d_rot| + 0.1) / (1 + exp(400 (d_goal - gate)))."""
+    gate = jax.nn.sigmoid(_STEEPNESS * (weights.gate - distance))
+    return gate / (jnp.abs(angle) + _EPSILON)
 
 
-def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
-    """min(duty / enough, 1) [] of the least busy of the `count` busiest fingertips; `duty` [F]."""
-    return jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)[-1]
+def tips_at_work(duty: jax.Array) -> jax.Array:
+    """min(duty / `WORKING_DUTY`, 1) [] of the least busy of the `WORKING_TIPS` busiest fingertips; `duty` [F].
+
+    With their mean, two busy fingertips would earn most of the bonus, and some seeds use only two.
+    """
+    return jnp.minimum(jnp.sort(duty)[::-1][:WORKING_TIPS] / WORKING_DUTY, 1.0)[-1]
 
 
 def trap_cost(tilt: jax.Array, ahead: jax.Array) -> jax.Array:
@@ -95,6 +109,8 @@ class Rotate(Task):
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
+    shape_names = KINDS
+    """What `ObjectParams.shape_index` counts."""
 
     config: RotateConfig
 
@@ -103,14 +119,10 @@ class Rotate(Task):
         if not (posture and reference):
             raise ConfigError(f"hand {hand.name!r} has no rotate: its TOML needs [rotate] with posture and reference")
         config = dataclasses.replace(config, posture=posture, reference=reference)
-        if len(config.posture) != hand.num_joints:
-            raise ConfigError(
-                f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
-            )
         self.config, self.hand, self.posture, self.turn = config, hand, posture, config.turn
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
-        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.object == "mesh" else drawn
+        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
@@ -133,11 +145,11 @@ class Rotate(Task):
 
     def unit_inertia(self, object: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
-        if self.config.object == "mesh":
+        if self.config.objects.mesh:
             return params.unit_inertia(object, self.config.objects)
-        return unit_inertia(self.config.object, object.size[0, 0])
+        return cube_inertia(object.size[0, 0])
 
-    def begin(self, key: jax.Array, start: Start | None) -> RotateGoal:
+    def begin(self, key: jax.Array | None, start: Start | None) -> RotateGoal:
         del key, start
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
@@ -164,11 +176,8 @@ class Rotate(Task):
         calm = jnp.abs(spin) <= turn.spin if turn.spin > 0 else True
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
-    def update(self, key: jax.Array, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
-        del key
-        return self._advance(goal, truth)
-
-    def _advance(self, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
+    def update(self, key: jax.Array | None, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
+        del key  # nothing here is random
         now, period = self.progress(goal, truth), self._period
         touching = self._touching(truth)
         clock = goal.clock + period
@@ -193,28 +202,21 @@ class Rotate(Task):
         )
 
     def goal_readings(self, goal: RotateGoal) -> tuple[jax.Array, jax.Array]:
-        """Command (unused) and goal orientation, as `Readings` carry them."""
         return jnp.zeros(()), self._quat(goal)
 
     def turns(self, goal: RotateGoal) -> jax.Array:
         return goal.turns
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        return random_push(
-            key,
-            object.mass,
-            probability=self.config.push_probability,
-            speed=self.config.push_speed,
-            period=self._period,
-        )
+        chance, speed = self.config.push_probability, self.config.push_speed
+        return random_push(key, object.mass, probability=chance, speed=speed, period=self._period)
 
     def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         away = length(truth.object_position - jnp.asarray(self.reference))
         lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(truth.object, truth.object_quat, truth.object_position)
-            lost |= low < self._palm + self.config.clearance
+            lost |= low < self._palm + CLEARANCE
         hopeless = (away > self.config.drop_radius) | (goal.clock - goal.last_success > self.config.patience)
         return lost | (goal.gives_up & hopeless)
 
@@ -225,10 +227,10 @@ class Rotate(Task):
         weights, now = self.config.reward, self.progress(goal, truth)
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
-        after = self._advance(goal, truth)
-        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
+        after = self.update(None, goal, truth)
+        work = tips_at_work(after.duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
-        asked = weights.bonus_tips * (goal.turns >= weights.tips_after).astype(jnp.float32)
+        asked = weights.bonus_tips * (goal.turns >= _FROM_GOAL).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
@@ -254,10 +256,7 @@ class Rotate(Task):
             "distance": now.distance,
             "pushed_out": (dropped & recent).astype(jnp.float32),
             "slipped": (dropped & ~recent).astype(jnp.float32),
-            "spin": mean["spin"],
-            "joint_speed": mean["joint_speed"],
-            "action_rate": mean["action_rate"],
-            "tilt": mean["tilt"],
+            **{name: mean[name] for name in ("spin", "joint_speed", "action_rate", "tilt")},
             "taxel_force": jnp.sum(truth.touch.force),
             **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
         }
@@ -278,7 +277,7 @@ class Rotate(Task):
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
         """Rows [count] of the pool, evenly spread over it; goals that end with a drop only."""
-        goal = dataclasses.replace(self.begin(jax.random.key(0), None), gives_up=jnp.zeros((), bool))
+        goal = dataclasses.replace(self.begin(None, None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 

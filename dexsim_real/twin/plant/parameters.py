@@ -33,7 +33,7 @@ class Band:
     low: float
     high: float
     unit: str
-    origin: str  # path in a task's configuration
+    origin: str  # path in a task's configuration; empty: the emulated hand's own
     nominal: float
     per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
     sides: str = "both"  # possible ends: "both", "high", "low"; "within": the hand's own range, not training's
@@ -108,7 +108,7 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
         "neck_radius": Band(0.010, 0.016, "m", "objects.neck_radius", 0.013),
         "neck_half": Band(0.008, 0.018, "m", "objects.neck_half", 0.013),
         "gap": Band(0.001, 0.009, "m", "release_gap", 0.005, "trial", "high"),
-        "release_speed": Band(0.0, 0.1, "m/s", "release_speed", 0.0, "trial", "high"),
+        "release_speed": Band(0.0, 0.1, "m/s", "", 0.0, "trial", "high"),  # training lets objects go at rest
         "reaction": Band(0.1, 0.5, "s", "release_delay", 0.3, sides="within"),
     },
     "rotate": {

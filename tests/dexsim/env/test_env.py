@@ -12,12 +12,9 @@ from c_scene import skin_law
 from episodes import with_episode
 
 from dexsim import observation
-from dexsim.core.compilation import jit
-from dexsim.env.evaluation import evaluation_of
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
 from dexsim.physics.interface import PhysicsState
-from dexsim.tasks.grasp.task import COMMANDS
 
 WORLDS = 8
 
@@ -74,14 +71,11 @@ def history(grasp_rollout):
 
 
 class TestPure:
-    def test_same_inputs_same_outputs(self, grasp_rollout, history):
-        for state, action, following in history[::4]:
-            assert_same(grasp_rollout.step(state, action), following)
-
-    def test_worlds_do_not_mix(self, grasp_rollout, history):
+    def test_same_inputs_same_outputs_and_worlds_do_not_mix(self, grasp_rollout, history):
         """A permuted batch gives permuted results, bit for bit."""
-        order = np.array([3, 1, 7, 0, 5, 2, 6, 4])
         state, action, following = history[6]
+        assert_same(grasp_rollout.step(state, action), following)
+        order = np.array([3, 1, 7, 0, 5, 2, 6, 4])
         assert_same(grasp_rollout.step(row(state, order), action[order]), row(following, order))
 
     def test_reset_depends_on_the_key_alone(self, grasp_rollout):
@@ -94,28 +88,6 @@ class TestPure:
     def test_keys_advance(self, history):
         data = [np.asarray(jax.random.key_data(state.key)) for state, _, _ in history]
         assert len(np.unique(np.concatenate(data), axis=0)) == WORLDS * len(history)
-
-    def test_a_batch_is_a_loop(self, grasp_env, history):
-        """`vmap` of the step against one world at a time; float32 in another order of fusion."""
-        single = jax.jit(grasp_env.step)
-        equal = []
-        for tick in (0, 9):
-            state, action, following = history[tick]
-            for world in range(WORLDS):
-                alone, batch = leaves(single(row(state, world), action[world])), leaves(following)
-                # Accelerations of hundreds of rad/s^2, to a thousandth of the largest; positions to 50 micrometres.
-                fast = 1e-3 * max(100.0, np.abs(alone[".physics.warmstart"]).max())
-                bounds = {".physics.warmstart": (2e-3, fast), ".physics.qpos": (1e-7, 5e-5)}
-                close = {
-                    path: np.allclose(value, batch[path][world], *bounds.get(path, (2e-3, 5e-3)))
-                    for path, value in alone.items()
-                }
-                equal.append(all(close.values()))
-                np.testing.assert_array_equal(alone[".key"], batch[".key"][world])
-                np.testing.assert_allclose(alone[".physics.qpos"], batch[".physics.qpos"][world], atol=5e-3)
-        # A solver stopped after so many iterations passes rounding on where it has not converged: the one
-        # world in some hundreds where a contact has not settled between sticking and sliding.
-        assert np.mean(equal) >= 0.8, equal
 
 
 class TestTick:
@@ -194,11 +166,10 @@ class TestTick:
             )
             np.testing.assert_allclose(after.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
 
-    @pytest.mark.parametrize("factor", [1.0, 3.0])
-    def test_actions_are_clipped(self, grasp_rollout, history, factor):
+    def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
-        action = factor * jnp.sign(actions(5))
-        after = grasp_rollout.step(state, action)
+        after = grasp_rollout.step(state, 3.0 * jnp.sign(actions(5)))
+        np.testing.assert_array_equal(after.readings.last_action, after.action)
         assert_same(after, grasp_rollout.step(state, jnp.sign(actions(5))))
         assert np.abs(after.action).max() == 1.0
         moved = np.asarray(after.joint_target - state.joint_target)
@@ -258,7 +229,11 @@ class TestEpisodes:
             total += np.asarray(after.reward)
             np.testing.assert_allclose(after.metrics["return"], total, rtol=1e-5, atol=1e-5)
         assert np.all(history[-1][2].metrics["length"] == len(history))
-        assert np.all(history[-1][2].length == len(history))
+
+    def test_a_random_clock_is_uniform(self, grasp_env, history):
+        state, limit = history[0][0], grasp_env.task.episode_ticks
+        draw = jax.vmap(lambda key: grasp_env.randomize_episode_time(row(state, 0), key).tick)
+        assert np.histogram(draw(jax.random.split(jax.random.key(6), 4000)), 4, (0, limit))[0].min() > 850
 
     def test_restart_touches_only_what_is_done(self, grasp_env, grasp_rollout, history):
         state = history[-1][2]
@@ -280,29 +255,6 @@ class TestEpisodes:
         # The object goes with its start.
         at = np.flatnonzero((np.asarray(grasp_env.pool.qpos) == ours[".physics.qpos"][0]).all(1))[0]
         np.testing.assert_array_equal(begun.episode.object.size[0], grasp_env.pool.object.size[at])
-
-    def test_stagger(self, grasp_env, history):
-        state = history[0][0]
-        keys = jax.random.split(jax.random.key(5), WORLDS)
-        spread = jax.vmap(grasp_env.randomize_episode_time)(state, keys)
-        limit = grasp_env.task.episode_ticks
-        assert len(np.unique(spread.tick)) >= 6
-        assert np.all((spread.tick >= 0) & (spread.tick < limit))
-        assert_same(dataclasses.replace(spread, tick=state.tick), state)
-        many = jax.vmap(lambda key: grasp_env.randomize_episode_time(row(state, 0), key).tick)(
-            jax.random.split(jax.random.key(6), 4000)
-        )
-        assert np.histogram(many, 4, (0, limit))[0].min() > 850
-
-    def test_evaluation_starts(self, grasp_env):
-        """Commands and shapes as planned, never changing; starts from a pool that is not training's."""
-        protocol = evaluation_of(grasp_env)
-        starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(50, 0))
-        assert np.all(np.asarray(starts.goal.fixed))
-        np.testing.assert_allclose(starts.goal.command, np.tile(np.float32(COMMANDS), 10))
-        assert np.bincount(starts.episode.object.shape_index).tolist() == [10] * 5
-        rows = {tuple(q) for q in np.asarray(grasp_env.pool.qpos)}
-        assert not any(tuple(q) in rows for q in np.asarray(starts.physics.qpos))
 
 
 class TestTrouble:
@@ -374,35 +326,6 @@ class TestReadings:
         tips = jax.vmap(lambda q: forward_kinematics(hand, q).tip_position)(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
-
-    def test_readings_carry_the_action_that_led_to_them(self, history):
-        for _, action, after in history:
-            np.testing.assert_array_equal(after.readings.last_action, np.clip(action, -1, 1))
-
-    def test_readings_are_as_old_as_the_latency_says(self, history):
-        """Angles lie `age` of the way back to the last tick: a regression finds each world's age.
-
-        Joints turn by some 0.1 rad a tick; noise of 3 mrad over 12 x 12 samples leaves 0.01.
-        """
-        old, new, read = (
-            np.stack(x)
-            for x in zip(
-                *(
-                    (
-                        before.physics.qpos[:, :12],
-                        after.physics.qpos[:, :12],
-                        after.readings.joint_position - after.episode.hand.encoder_bias,
-                    )
-                    for before, after in ((s, f) for s, _, f in history)
-                ),
-                strict=True,
-            )
-        )
-        change = old - new
-        age = np.sum((read - new) * change, axis=(0, 2)) / np.sum(change**2, axis=(0, 2))
-        wanted = np.asarray(history[0][0].episode.hand.sensing_latency)
-        assert np.ptp(wanted) > 0.2
-        np.testing.assert_allclose(age, wanted, atol=0.03)
 
 
 class TestTouch:

@@ -62,22 +62,6 @@ def make():
     patch.undo()
 
 
-@pytest.mark.slow
-def test_a_tilted_hand_pulls_the_object_aside_and_leaves_the_orientation_alone(make):
-    """The bridge aligns the IMU to a known pose of the object, so that a mount that leans is no error of the IMU."""
-    env = make(Sensing(orientation=ImuConfig(bias=0.0)), Randomization(gravity_tilt=0.1))
-    draw = jax.jit(lambda key: env.reset(key).episode)
-    for key in jax.random.split(jax.random.key(0), 4):
-        episode = draw(key)
-        push = np.asarray(env.sampler.tilt_force(episode)) / float(episode.object.mass)
-        pitch, roll = np.asarray(episode.hand.tilt, np.float64)
-        down = np.array([1.0, -np.tan(roll), np.tan(pitch)])
-        np.testing.assert_allclose(push, 9.81 * (down / np.linalg.norm(down) - [1.0, 0.0, 0.0]), atol=1e-5)
-        true_up = -(np.array([9.81, 0.0, 0.0]) + push)
-        assert 0.005 < np.arccos(-true_up[0] / np.linalg.norm(true_up)) < 0.15
-        assert not np.any(np.asarray(episode.imu.bias))
-
-
 @pytest.fixture(scope="module")
 def drawn(make):
     """An environment and 64 resets at three scales."""
@@ -113,14 +97,6 @@ class TestScale:
         ball = np.mean(objects.mass) * 0.4 * radius**2
         # A sphere is a capsule with a straight part of 0.2 mm.
         np.testing.assert_allclose(state.episode.object.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
-
-    def test_half_is_half_way(self, drawn):
-        _, states = drawn
-        for name in ("mass", "com", "friction", "contact"):
-            low, half, high = (np.asarray(getattr(states[scale].episode.object, name)) for scale in (0.0, 0.5, 1.0))
-            np.testing.assert_allclose(half, (low + high) / 2, rtol=1e-4, atol=1e-6, err_msg=name)
-        low, half, high = (np.asarray(states[scale].episode.hand.encoder_bias) for scale in (0.0, 0.5, 1.0))
-        np.testing.assert_allclose(half, (low + high) / 2, atol=1e-7)
 
     def test_restarts_draw_at_the_states_scale(self, drawn):
         env, states = drawn

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from episodes import reset_to
-from scipy import stats
 from simple_physics import SimplePhysics
 
 import dexsim
@@ -14,7 +13,6 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.evaluation import evaluation_of, make_plan
 from dexsim.env.state import Start
 from dexsim.objects.config import ObjectConfig
-from dexsim.objects.params import damping_ratio
 from dexsim.tasks.grasp.config import GraspConfig
 
 MANY = 400
@@ -51,16 +49,6 @@ def spans(config):
 
 
 class TestBulk:
-    @pytest.mark.slow
-    def test_it_is_uniform_in_its_ranges_whatever_the_row(self, env, drawn):
-        low, high = spans(env.config.objects).T
-        place = (bulk(drawn) - low) / (high - low)
-        for row in np.flatnonzero(~np.asarray(env.pool.object.extreme)):
-            for values in place[row].T:
-                assert stats.kstest(values, "uniform").pvalue > 1e-4
-        bounce = np.asarray(damping_ratio(jnp.asarray(env.config.objects.restitution)))
-        assert np.all((drawn.contact[..., 1] <= bounce[0] + 1e-6) & (drawn.contact[..., 1] >= bounce[1] - 1e-6))
-
     def test_inertia_follows_mass_and_shape(self, env, drawn):
         """A box's is m/3 (b^2 + c^2); every ratio to it lies in the range, the same for all three axes."""
         boxes = np.flatnonzero(np.asarray(drawn.shape_index)[:, 0] == 1)

@@ -9,11 +9,13 @@ from episodes import ground_truth
 from simple_physics import SimplePhysics
 
 import dexsim
+from dexsim import observation
 from dexsim.objects.config import ObjectConfig
-from dexsim.observation import ObservationConfig, Readings
+from dexsim.observation import Readings
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import revert_if_diverged
 from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
 
 MOMENT = 1e-6  # s
 FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="100"/></body></worldbody></mujoco>"""
@@ -23,11 +25,9 @@ FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="1
 def env():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        config = GraspConfig(
-            pool_size=4,
-            objects=ObjectConfig(shapes=("sphere",)),
-            observation=ObservationConfig(add_critic=("object_orientation", "object_spin")),
-        )
+        critic = (*observation.GRASP, "object_orientation", "object_spin")
+        patch.setattr(Grasp, "fields", {"actor": observation.GRASP, "critic": critic})
+        config = GraspConfig(pool_size=4, objects=ObjectConfig(shapes=("sphere",)))
         yield dexsim.make("grasp", config, backend="mjx")
 
 

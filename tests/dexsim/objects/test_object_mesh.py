@@ -11,14 +11,13 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.core.errors import AssetError
 from dexsim.geometry import distance, mesh, rotations, sdf
 from dexsim.objects.boxes import fit_boxes
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
 from dexsim.objects.params import sample_object, toward_nominal, unit_inertia
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.rotate.config import RotateConfig
 
 WORLDS = 4
 BARS = sdf.Shape(
@@ -128,11 +127,6 @@ class TestErrors:
                 "grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=parts)), hand=hand
             )
         assert "\n" not in str(caught.value)
-
-    @pytest.mark.parametrize("change", [{"object": "mesh"}, {"objects": ObjectConfig(mesh="mug.stl")}])
-    def test_a_rotation_names_both(self, change):
-        with pytest.raises(ConfigError, match="a mesh needs object 'mesh' and the name of its file"):
-            RotateConfig(**change)
 
 
 class TestDraw:

@@ -1,4 +1,4 @@
-"""The C backend against closed forms and a scene in C MuJoCo that is compiled a second time; its calls from XLA."""
+"""The C backend against closed forms and a second scene in C MuJoCo; its calls from XLA; rubber of any thickness."""
 
 import dataclasses
 import json
@@ -18,12 +18,12 @@ from paths import ROOT
 from scipy.spatial.transform import Rotation
 
 from dexsim.core.errors import ConfigError
-from dexsim.geometry import rotations
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import c_backend
 from dexsim.physics import model as scene_model
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
+from dexsim.physics.model import build_scene
 from dexsim.physics.physics import Physics
 
 WORLDS = 8
@@ -100,24 +100,15 @@ class TestClosedForms:
         assert not np.any(np.asarray(force))
         np.testing.assert_allclose(after.warmstart[:, 12:15], acceleration, rtol=1e-5)
 
-    def test_a_spinning_object_turns_about_its_centre_of_mass(self, hand, grips):
-        """Without forces the centre of mass keeps its velocity; the object's origin circles round it."""
-        physics = make(hand, gravity=(0, 0, 0), timestep=0.0005)
-        target, state = at(grips[:1], AWAY, velocity=[0.1, 0, 0, 0, 0, 20.0])
-        com = np.float32([0.02, 0.0, 0.0])
-        target = dataclasses.replace(target, com=jnp.asarray(com)[None], inertia=jnp.full((1, 3), 1e-4))
-        step = jax.jit(jax.vmap(lambda state: physics.advance(hold, row0(target), state, jnp.zeros(3))[0]))
-
-        def centre(state):
-            turn = rotations.quat_to_matrix(state.qpos[0, 15:])
-            return np.asarray(state.qpos[0, 12:15] + turn @ com)
-
-        begun, count = centre(state), 66
-        for _ in range(count):
-            state = step(state)
-        moved = (centre(state) - begun) / (count * 3 * 0.0005)
-        # v + w x r at the start: the origin moves at 0.1 m/s along x, the centre at 0.4 m/s along y as well.
-        np.testing.assert_allclose(moved, [0.1, 0.4, 0.0], atol=0.02)
+    def test_an_object_that_somebody_holds_stays_and_is_weightless(self, physics, grips):
+        target, state = map(row0, at(grips[:1], AWAY, velocity=[0.1, 0, 0, 0, 0, 0]))
+        advance = jax.jit(lambda held: physics.advance(hold, target, state, jnp.ones(3), held=held))
+        free, held = advance(jnp.array(False)).state, advance(jnp.array(True)).state
+        assert_same(free, physics.advance(hold, target, state, jnp.ones(3)).state)
+        np.testing.assert_array_equal(held.qpos[12:], state.qpos[12:])
+        np.testing.assert_array_equal(held.qvel[12:], 0.0)
+        np.testing.assert_allclose(held.warmstart[12:15], 0.0, atol=1e-4)  # no acceleration by gravity or push
+        np.testing.assert_array_equal(held.qpos[:12], free.qpos[:12])
 
     def test_sliding_on_the_palm(self, hand, grips):
         """A box that F pushes over the palm's plane gains (F - mu N) / m, and N is what its weight and lift ask for."""
@@ -238,37 +229,6 @@ class TestStateless:
             state = tick(target, state, push)[0]
         assert_same(scanned, state)
 
-    def test_objects_that_are_turned_leave_others_upright(self, hand, physics, tick, grips):
-        """One scene serves environments whose objects have an orientation of their own, and some that have none."""
-        upright, state, _ = batch_of(grips[8:12])
-        turned = dataclasses.replace(upright, quat=jnp.tile(jnp.array([0.8, 0.0, 0.6, 0.0]), (4, len(SLOTS), 1)))
-        assert upright.quat is None
-        push = jnp.zeros((4, 3))
-        before = tick(upright, state, push)
-        other = tick(turned, state, push)
-        assert np.any(np.asarray(other[0].qvel) != np.asarray(before[0].qvel))
-        assert_same(tick(upright, state, push), before)
-
-    def test_a_saved_state_continues_to_the_bit(self, hand, physics, tick, grips):
-        """In a new engine, as after a restart, whose cache is empty."""
-        target, state, _ = batch_of(grips[:4])
-        push = jnp.zeros((4, 3))
-        for _ in range(5):
-            state = tick(target, state, push)[0]
-        saved = jax.tree.map(np.array, state)
-        for _ in range(5):
-            state = tick(target, state, push)[0]
-        jax.block_until_ready(state)
-        c_backend._engines.pop(physics.engine._key)
-        fresh = make(hand)
-        again = jax.jit(jax.vmap(lambda t, s, p: fresh.advance(hold, t, s, p)))
-        resumed = jax.tree.map(jnp.asarray, saved)
-        for _ in range(5):
-            resumed = again(target, resumed, push)[0]
-        assert_same(resumed, state)
-        assert fresh.engine._engine._worlds, "the new engine was not used"
-        c_backend._engines[physics.engine._key] = physics.engine._engine
-
 
 def test_a_gradient_is_refused_by_name(physics, grips):
     target, state, _ = batch_of(grips[:1])
@@ -317,7 +277,7 @@ class TestTrouble:
             jax.block_until_ready(tick(*given))
 
 
-# --- calls from compiled programs, each in a process of its own: two cores, Ctrl-C, cached programs ----------------
+# --- calls from compiled programs, each in a process of its own: two cores, Ctrl-C, cached programs ---
 
 PROGRAM = """
 import json, os, sys, time
@@ -419,3 +379,78 @@ def test_programs_are_cached(tmp_path):
         runs.append(json.loads(out))
     assert runs[0][0] == 0 and runs[1][0] > 0
     assert runs[0][1] == runs[1][1]
+
+
+# --- fingertips as thick as their episode has them, and fingers that do not pass through each other ---
+
+THICK, THIN = 0.003, 0.001
+
+
+@pytest.fixture(scope="module")
+def scenes(hand):
+    """{thickness compiled in: scene} on C MuJoCo."""
+    return {
+        cover: Physics(
+            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=cover), gravity=GRAVITY, backend="c"
+        )
+        for cover in (THICK, THIN, 0.0)
+    }
+
+
+@pytest.fixture(scope="module")
+def grip(hand, grasp_env):
+    """(object, state) of a squeezed box."""
+    start = row(grasp_env.pool, rows_of(grasp_env.pool, "box")[0])
+    _, qpos, qvel, warmstart, torque = squeeze(hand, start, np.random.default_rng(0))
+    return start.object, PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(warmstart)), torque
+
+
+@pytest.mark.parametrize(("change", "compiled"), [(THIN - THICK, THIN), (-THICK, 0.0), (-0.01, 0.0)])
+def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compiled):
+    """Less than no rubber is no rubber."""
+    object, state, torque = grip
+    motors = lambda *_: jnp.asarray(torque)  # noqa: E731
+    drawn, force = scenes[THICK].advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=change)
+    expected, pressed = scenes[compiled].advance(motors, object, state, jnp.zeros(3))
+    np.testing.assert_allclose(force, pressed, atol=2e-3)
+    np.testing.assert_allclose(drawn.qpos, expected.qpos, atol=1e-5)
+    plain = scenes[THICK].advance(motors, object, state, jnp.zeros(3))[1]
+    assert np.abs(plain - force).max() > 0.5, "the rubber makes no difference: the test tests nothing"
+
+
+def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
+    """C MuJoCo leaves out contacts of geoms whose bounding spheres are apart."""
+    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], pad_thickness_delta=THICK - THIN)
+    size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
+    tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
+    assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)
+    np.testing.assert_allclose(around[tips], size[tips, 0], atol=1e-8)
+
+
+def test_index_and_middle_finger_stop_each_other(hand):
+    """The index finger swings into the middle one at full torque, and then rests on it."""
+    model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c").model
+    model.opt.timestep = 0.005  # s; the motors below are explicit
+    data = mujoco.MjData(model)
+    names = list(hand.joint_names)
+    bend, angle = names.index("index_bend"), np.where(np.arange(12) < 3, 0.0, 0.3)
+    angle[bend] = hand.joint_lower[bend]
+    data.qpos[:12], data.qpos[12:15] = angle, (0.0, 0.0, 2.0)
+    data.qpos[bend] = 0.0
+    data.qpos[15] = 1.0
+    depth = []
+    for _ in range(300):
+        torque = 3.0 * (angle - data.qpos[:12]) - 0.1 * data.qvel[:12]
+        torque[bend] = -hand.torque_limit[bend]
+        data.qfrc_applied[:12] = torque
+        mujoco.mj_step(model, data)
+        depth.append(
+            min(
+                mujoco.mj_geomDistance(model, data, model.geom(a).id, model.geom(b).id, 0.05, np.zeros(6))
+                for a in ("index_link1", "index_core")
+                for b in ("mid_link1", "mid_core")
+            )
+        )
+    assert data.qpos[bend] > hand.joint_lower[bend] + 0.02, "it passes through"
+    assert -2e-3 < min(depth) < 0.0
+    assert min(depth[10:]) > -1e-3

@@ -1,18 +1,16 @@
-"""What reaches the CUDA driver from an XLA program, with a driver of our own: no GPU is needed."""
+"""What reaches the CUDA driver, with a driver of our own, and each task's kernel through NVRTC: no GPU is needed."""
 
 import ctypes
-import functools
 import shutil
 import subprocess
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from cuda_kernel import cuda_scene, motor_law
 
+import dexsim
 from dexsim.core.errors import ConfigError
-from dexsim.physics import ffi
-from dexsim.physics.cuda import launch
+from dexsim.physics.cuda import launch, program
 from dexsim.physics.cuda.scene import Buffer, Settings, args_type, declare_args
 
 SETTINGS = Settings(substeps=5, iterations=10, line_search=12, tolerance=1e-5, line_search_tolerance=0.25)
@@ -85,102 +83,54 @@ def test_the_struct_is_that_of_cpp(tmp_path):
     assert size == ctypes.sizeof(args)
 
 
-def test_what_a_machine_lacks_is_named(driver, monkeypatch):
-    monkeypatch.setattr(driver, "attribute", lambda which, device: 39_999)
-    with pytest.raises(ConfigError, match="8 worlds need 40000 bytes of shared memory, of which GPU 0 .* 39999"):
-        launch.Kernel(b"code", SETTINGS, len(BUFFERS))
-    monkeypatch.setattr(driver, "attribute", lambda which, device: 8 + device)
-    with pytest.raises(ConfigError, match="not of sm_88, sm_99: choose with CUDA_VISIBLE_DEVICES"):
-        launch.architecture.__wrapped__()
-    monkeypatch.setattr(ctypes, "CDLL", lambda name: (_ for _ in ()).throw(OSError(name)))
-    with pytest.raises(ConfigError, match="needs NVIDIA's driver, with libcuda.so.1"):
-        launch.Driver()
+# --- kernels compile with NVRTC ---
 
 
-class Call:
-    """A call as XLA makes it: a frame with arrays on an imagined device."""
-
-    def __init__(self, kernel, arguments, results, stage=3):
-        self.kept, self.errors = [], []
-        stream = self.keep(ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(self.stream))
-        error = self.keep(ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(self.error))
-        api = self.keep(ffi._Api())
-        api.get_stream, api.create_error = (ctypes.cast(f, ctypes.c_void_p).value for f in (stream, error))
-        frame = self.frame = ffi.Frame(api=ctypes.pointer(api), stage=stage)
-        frame.arguments, frame.results = self.buffers(arguments), self.buffers(results)
-        spans = [self.keep(self.span(text)) for text in (b"kernel", kernel.encode())]
-        frame.attributes.size = 1
-        frame.attributes.types = self.keep((ctypes.c_int * 1)(4))
-        frame.attributes.names, frame.attributes.items = (
-            self.keep((ctypes.c_void_p * 1)(ctypes.addressof(span))) for span in spans
-        )
-
-    def keep(self, value):
-        self.kept.append(value)
-        return value
-
-    def span(self, text):
-        memory = self.keep(ctypes.create_string_buffer(text))
-        return ffi._Span(ctypes.addressof(memory), len(text))
-
-    def buffers(self, arrays):
-        made = []
-        for address, shape in arrays:
-            dims = self.keep((ctypes.c_int64 * len(shape))(*shape))
-            made.append(self.keep(ffi.Buffer(data=address, rank=len(shape), dims=dims)))
-        items = self.keep((ctypes.c_void_p * len(made))(*map(ctypes.addressof, made)))
-        return ffi.Buffers(size=len(made), items=items)
-
-    def stream(self, address):
-        ffi._StreamArguments.from_address(address).stream = 55
-
-    def error(self, address):
-        self.errors.append(ffi._ErrorArguments.from_address(address).message.decode())
-        return 1
-
-    def answer(self):
-        return ffi._answer(launch._serve, launch.TRAITS, ctypes.addressof(self.frame))
+@pytest.fixture(scope="module")
+def compiler():
+    try:
+        return program.find_compiler()
+    except ConfigError as error:
+        pytest.skip(str(error))
 
 
-@pytest.mark.parametrize(("batch", "worlds"), [((), 1), ((13,), 13), ((2, 3, 5), 30)])
-def test_a_call_of_xlas_is_one_launch(driver, batch, worlds):
-    name = launch.load(b"code", SETTINGS, len(BUFFERS))
-    arguments = [(100, (*batch, 4)), (200, (*batch, 2)), (300, batch)]
-    assert Call(name, arguments, [(400, (*batch, 4))]).answer() is None
-    ((place, _, stream, pointers, numbers),) = driver.launches
-    assert place[0] == -(-worlds // 8) and numbers[0] == worlds
-    assert stream == 55 and pointers == [100, 200, 300, 400]
+@pytest.mark.parametrize("task", ["rotate", "grasp"])
+def test_tasks_compile(task, compiler):
+    env = dexsim.make(task, backend="c")
+    text = program.source(cuda_scene(env), motor_law(env))
+    assert text == program.source(cuda_scene(env), motor_law(env)), "kernels are cached by their text"
+    code = compiler.compile(text, program.headers(), (*program.OPTIONS, "--gpu-architecture=sm_90"))
+    assert code[:4] == b"\x7fELF"
+    for name in (program.ENTRY, program.SHARED_BYTES):
+        assert name.encode() in code
 
 
-def test_errors_are_xlas(driver):
-    name = launch.load(b"code", SETTINGS, len(BUFFERS))
-    arrays = [(100, (4,))] * 3, [(400, (4,))]
-    driver.fails = "cuLaunchKernel"
-    for kernel, message in ((name, "cuLaunchKernel: out of luck"), ("unknown", "has not made the environment")):
-        call = Call(kernel, *arrays)
-        assert call.answer() == 1 and message in call.errors[0].splitlines()[0]
-    assert Call(name, *arrays, stage=0).answer() is None, "only what is executed is launched"
+class CountingCompiler(program.Compiler):
+    """A compiler that only counts."""
+
+    def __init__(self, version=(13, 0)):
+        self.version, self.calls = version, 0
+
+    def compile(self, text, included, options):
+        self.calls += 1
+        return f"{self.version} {text} {options}".encode()
 
 
-def test_xla_learns_that_launches_can_be_recorded(driver):
-    call = Call("", [], [])
-    metadata = ffi._Metadata()
-    request = ffi._MetadataRequest(type=1, metadata=ctypes.pointer(metadata))
-    call.frame.extension = ctypes.addressof(request)
-    assert call.answer() is None
-    assert metadata.traits == 1 and not driver.launches
-
-
-def tick(name, qpos, count, flag):
-    return launch.call(name, [jax.ShapeDtypeStruct((4,), jnp.float32)], qpos, count, flag)
-
-
-def test_a_batch_of_batches_is_one_call():
-    """What is the same for all worlds is repeated: the kernel reads a row for each."""
-    one = functools.partial(tick, "name")
-    both = jax.vmap(jax.vmap(one, in_axes=(0, None, None)), in_axes=(0, 0, None))
-    given = jnp.zeros((3, 5, 4)), jnp.zeros((3, 2), jnp.int32), jnp.array(True)
-    text = jax.jit(both).trace(*given).lower(lowering_platforms=("cuda",)).as_text()
-    (call,) = [line for line in text.splitlines() if "custom_call" in line]
-    assert "@dexsim_cuda" in call and 'kernel = "name"' in call
-    assert "(tensor<3x5x4xf32>, tensor<3x5x2xi32>, tensor<3x5xi1>) -> tensor<3x5x4xf32>" in call
+def test_compiled_code_is_kept(tmp_path, monkeypatch):
+    """By text, GPU, headers and compiler, in a folder that no one else may write to."""
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    one, other = CountingCompiler(), CountingCompiler((13, 1))
+    monkeypatch.setattr(program, "find_compiler", lambda: one)
+    for text, architecture in (("a", "sm_90"), ("a", "sm_90"), ("b", "sm_90"), ("a", "sm_80")):
+        assert program.compile_kernel(text, architecture).startswith(f"(13, 0) {text}".encode())
+    assert one.calls == 3
+    (tmp_path / "cuda").chmod(0o777)
+    program.compile_kernel("a", "sm_90")
+    assert one.calls == 4
+    (tmp_path / "cuda").chmod(0o700)
+    monkeypatch.setattr(program, "headers", lambda: {"tick.cuh": "changed"})
+    program.compile_kernel("a", "sm_90")
+    assert one.calls == 5
+    monkeypatch.setattr(program, "find_compiler", lambda: other)
+    program.compile_kernel("a", "sm_90")
+    assert other.calls == 1

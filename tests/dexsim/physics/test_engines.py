@@ -1,9 +1,10 @@
-"""Engines `c` and `mjx` in one grip and one slide against C MuJoCo, and gradients through `mjx`.
+"""Engines `c` and `mjx` in one grip and one slide against C MuJoCo, and gradients through contacts by `mjx`.
 
 `cuda` has the same states in an emulated warp (`test_cuda_kernel`) and on a GPU (`test_on_gpu`).
 """
 
 import dataclasses
+import functools
 
 import c_scene
 import jax
@@ -15,7 +16,9 @@ from c_scene import GRAVITY, row, rows_of, squeeze, stack
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError
+from dexsim.hand.load import load_hand
 from dexsim.objects.config import SLOTS, ObjectConfig
+from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
@@ -84,31 +87,6 @@ def test_a_grip_and_a_slide_are_c_mujocos(hand, worlds, mjx_physics, backend):
     np.testing.assert_allclose(after.qvel, velocity, atol=5e-3)
 
 
-@pytest.mark.slow
-def test_gradients_through_a_grip_are_finite_differences(worlds, mjx_physics):
-    """Of velocities and forces after two sub-steps, along a random change of the torques, of friction, and of mass."""
-    (object, state, torque, push), *_ = jax.tree.map(lambda x: x[0], worlds)
-    weight, way = (np.float32(np.random.default_rng(k).normal(size=n)) for k, n in ((0, 18), (1, 12)))
-
-    def outcome(along):
-        """Of how far [3] torque, friction and mass have changed."""
-        held = dataclasses.replace(object, friction=object.friction + along[1], mass=object.mass + along[2])
-        result = mjx_physics.advance(lambda *_: torque + along[0] * way, held, state, push)
-        return jnp.sum(weight * result.state.qvel) + jnp.sum(result.finger_force)
-
-    def derivatives(x):
-        _, push = jax.linearize(outcome, x)
-        return jax.linear_transpose(push, x)(jnp.float32(1.0))[0], jax.vmap(push)(jnp.eye(3))
-
-    steps = np.diag(np.float32([3e-3, 0.01, 0.003]))
-    after, before = jit(jax.vmap(outcome), once=True)(np.concatenate([steps, -steps])).reshape(2, 3)
-    numeric = (after - before) / (2 * np.diag(steps))
-    reverse, forward = jit(derivatives, once=True)(jnp.zeros(3))
-    assert abs(numeric[0]) > 0.1
-    np.testing.assert_allclose(reverse, numeric, rtol=0.05)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-3)
-
-
 def test_what_mjx_refuses_is_named(hand, monkeypatch):
     from mujoco import mjx
 
@@ -118,3 +96,106 @@ def test_what_mjx_refuses_is_named(hand, monkeypatch):
     monkeypatch.setattr(mjx, "put_model", refuse)
     with pytest.raises(AssetError, match="backend mjx: no such joint"):
         physics_of(hand, "mjx")
+
+
+# --- gradients, forward and reverse: two fingers that pinch a capsule ---
+
+# One finger has a coupled joint, the other dry friction and a limit that presses.
+MJCF = """
+<mujoco>
+  <compiler angle="radian"/>
+  <default>
+    <joint type="hinge" damping="0.01" armature="0.0005" actuatorfrcrange="-.5 .5"/>
+    <geom contype="0" conaffinity="0"/>
+    <default class="tip"><geom type="sphere" size=".01" mass=".01" contype="1" conaffinity="1"/></default>
+  </default>
+  <worldbody>
+    <body name="base"><geom name="base" type="box" size=".02 .04 .005" mass=".2"/>
+      <body name="a1" pos="0 .0326 0">
+        <joint name="a" axis="1 0 0" range="-0.5 1.2"/>
+        <geom type="capsule" fromto="0 0 0 0 0 .02" size=".005" mass=".02"/>
+        <body name="a2" pos="0 0 .025">
+          <joint name="a_next" axis="1 0 0" range="-1 2"/>
+          <geom name="a2" class="tip" pos="0 0 .025"/>
+          <site name="a_tip" pos="0 0 .025"/>
+        </body>
+      </body>
+      <body name="b1" pos="0 -.0326 0">
+        <joint name="b" axis="-1 0 0" range="0.01 1.2" frictionloss="0.003"/>
+        <geom name="b1" class="tip" pos="0 0 .05"/>
+        <site name="b_tip" pos="0 0 .05"/>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint name="couple" joint1="a_next" joint2="a" polycoef="0 0.7 0 0 0"/></equality>
+</mujoco>
+"""
+TOML = """
+model = "two.xml"
+taxels = "two.csv"
+taxel_grid = [1, 1]
+palm = "base"
+joints = ["a", "b"]
+speed_limits = [8, 8]
+[[fingers]]
+name = "a"
+tip = "a_tip"
+root_joint = "a"
+[[fingers]]
+name = "b"
+tip = "b_tip"
+root_joint = "b"
+"""
+CSV = "finger,column,row,x,y,z,nx,ny,nz,area\na,0,0,0,-.01,.025,0,-1,0,1e-5\nb,0,0,0,.01,.05,0,1,0,1e-5\n"
+
+
+@pytest.fixture(scope="module")
+def physics(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("two")
+    for name, text in (("two.xml", MJCF), ("two.csv", CSV), ("two.toml", TOML)):
+        (folder / name).write_text(text)
+    size, config = np.float32([[0.02, 0.03, 0]]), PhysicsConfig(substeps=2)
+    return Physics(load_hand(folder / "two.toml"), ("capsule",), size, config, gravity=(9.81, 0, 0), backend="mjx")
+
+
+def test_gradients_in_a_pinch_are_finite_differences(physics):
+    """Of the object's velocity and the fingertips' forces, where contacts stick and where they slip."""
+    object = ObjectParams(
+        shape_index=jnp.int32(0),
+        size=jnp.array([[0.02, 0.03, 0]]),
+        position=jnp.zeros((1, 3)),
+        active=jnp.ones(1, bool),
+        mass=jnp.float32(0.1),
+        inertia=jnp.array([5e-5, 5e-5, 2e-5]),
+        com=jnp.zeros(3),
+        friction=jnp.float32(0.0),
+        contact=jnp.array([1700.0, 1.0]),
+        kinds=("capsule",),
+    )
+    pose = jnp.array([0.003, 0.002, 0.008, 0, 0, 0.05, 1, 0, 0, 0])  # joint b is beyond its limit
+    speed = jnp.array([0.1, 0.07, 0.05, 0.02, 0.01, -0.03, 0.4, -0.2, 0.3])
+    weight = jnp.asarray(np.random.default_rng(0).normal(size=12), jnp.float32)
+
+    def outcome(x):
+        """Of targets [2] of the joints, friction and mass."""
+
+        def law(substep, position, velocity):
+            return 2.0 * (x[:2] - position) - 0.05 * velocity
+
+        held = dataclasses.replace(object, friction=x[2], mass=x[3])
+        result = physics.advance(law, held, PhysicsState(pose, speed, jnp.zeros(9)), jnp.zeros(3))
+        return jnp.sum(weight * jnp.concatenate([result.state.qvel[3:], result.finger_force.ravel()]))
+
+    @functools.partial(jit, once=True)
+    def derivatives(x):
+        """Value, gradient, and slope along [1, 1, 1, 1] in forward mode, from one linearisation: one compilation."""
+        value, push = jax.linearize(outcome, x)
+        return value, jax.linear_transpose(push, x)(jnp.float32(1.0))[0], push(jnp.ones(4))
+
+    for friction in (0.9, 0.1):
+        x, steps = np.float32([0.06, 0.08, friction, 0.1]), np.diag(np.float32([0.01, 0.01, 0.02, 0.002]))
+        _, reverse, forward = derivatives(x)
+        numeric = [(derivatives(x + step)[0] - derivatives(x - step)[0]) / (2 * step.sum()) for step in steps]
+        np.testing.assert_allclose(reverse, numeric, rtol=0.01, atol=1e-3)
+        assert float(forward) == pytest.approx(float(reverse.sum()), rel=1e-4)
+        assert (reverse[2] != 0) == (friction == 0.1), "contacts that stick do not feel friction, those that slip do"

@@ -32,7 +32,7 @@ extern "C" void run(const void **constants, int worlds, int joints, int substep,
 def in_numpy(recorded, constants, folder):
     """The law as a function of sub-step, position [B, J] and velocity [B, J]."""
     del folder
-    return evaluator(recorded.text.encode()).bind(constants)
+    return evaluator(recorded.text.encode())(constants)
 
 
 def in_cpp(recorded, constants, folder):

@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 from dexsim.core.errors import AssetError
-from dexsim.physics.guard import check_model
+from dexsim.physics.model import check_model
 
 
 def scene(*, actuator="", sensor="", joint="", option="", extra="", world=""):
@@ -62,12 +62,6 @@ def test_ignored_features_are_refused(parts, feature):
     text = str(error.value)
     assert text.startswith("some/hand.xml: cannot simulate: ") and feature in text
     assert ";" not in text  # this feature and no other
-
-
-def test_all_problems_are_named_at_once():
-    actuators = motor('delay=".03" nsample="20" armature=".01"') + '<motor joint="knuckle" armature=".1"/>'
-    with pytest.raises(AssetError, match=r"actuator delay.*armature \(actuator tendon, #1\).*joint damping.*fluid"):
-        check_model(scene(actuator=actuators, joint='damping=".1 .2"', option='density="1.2"'))
 
 
 def test_what_the_engines_simulate_passes(hand):

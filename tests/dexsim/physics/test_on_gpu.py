@@ -95,18 +95,6 @@ def test_a_captured_graph_reads_its_inputs_anew(hand, grips):
     assert np.abs(other - first).max() > 0.5
 
 
-def test_memory_grows_as_the_batch(hand):
-    """XLA's own count of what a step needs at a time: twice the environments, at most twice the memory."""
-    needed = []
-    for worlds in (16, 32):
-        env = dexsim.make("grasp", GraspConfig(pool_size=16), backend="cuda")
-        state = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), worlds))
-        program = jit(jax.vmap(env.step)).lower(state, jnp.zeros((worlds, env.action_size))).compile()
-        memory = program.memory_analysis()
-        needed.append(memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes)
-    assert 1.2 < needed[1] / needed[0] < 2.1, needed
-
-
 def test_cuda_repeats_to_the_bit(hand, grips):
     """50 ticks in a scan, also in a batch that does not fill its last block and in a batch of batches."""
     inputs, *_ = grips

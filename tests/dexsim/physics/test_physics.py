@@ -1,6 +1,5 @@
 """Choosing an engine, and building its scene."""
 
-import dataclasses
 import shutil
 import types
 
@@ -53,10 +52,6 @@ def test_configurations_that_are_refused(changes, message):
         PhysicsConfig(**changes)
 
 
-def test_the_control_period():
-    assert PhysicsConfig(timestep=0.004, substeps=5).control_period == pytest.approx(0.02)
-
-
 @pytest.mark.parametrize(("backend", "converged"), [("c", 20), ("cuda", 10), ("mjx", 10)])
 def test_iterations_and_tolerance_are_the_solvers(hand, backend, converged):
     for iterations, expected in ((0, converged), (3, 3), (30, 30)):
@@ -71,11 +66,3 @@ def test_a_model_without_named_contact_geoms(hand, tmp_path):
     path.write_text(path.read_text().replace('name="ring_link1" class', "class"))
     with pytest.raises(AssetError, match=f"{path}.*needs a name"):
         make(load_hand(tmp_path / "xhand_right.toml"))
-
-
-def test_a_model_that_needs_what_the_scene_drops(hand, tmp_path):
-    text = hand.model_path.read_text().replace("<worldbody>", "<option density='1.2'/><worldbody>")
-    broken = dataclasses.replace(hand, model_path=tmp_path / "hand.xml")
-    broken.model_path.write_text(text)
-    with pytest.raises(AssetError, match="hand.xml: cannot simulate: fluid forces"):
-        make(broken)

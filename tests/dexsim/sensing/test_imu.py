@@ -70,7 +70,8 @@ def test_an_episodes_imu_is_as_wide_as_the_ranges_and_the_curriculum_together(ha
         config = RotateConfig(randomization=Randomization(scale=scale))
         task = Rotate(config, hand)
         sampler = EpisodeSampler(config, hand, task, SensorSuite(config, hand, task))
-        return sampler.sample_hand(jax.random.key(1), jax.random.key(2), *more)[1]
+        keys, cube = jax.random.split(jax.random.key(1), 3), task.sample_object(jax.random.key(2), config)
+        return sampler.sample(*keys, cube, *map(jnp.float32, more)).imu
 
     full, part = drawn(1.0), drawn(ranges, curriculum)
     for name in ("bias", "drift", "delay"):

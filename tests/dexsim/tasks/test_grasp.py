@@ -15,7 +15,7 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.errors import ConfigError
-from dexsim.objects.config import SHAPES, ObjectConfig
+from dexsim.objects.config import ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import (
     COMMANDS,
@@ -40,16 +40,13 @@ WEIGHTS = GraspReward(
     velocity=-0.002,
     drop=-20.0,
     sigma=0.1,
-    tail_sigma=0.4,
     tail=0.4,
     thumb="loose",
     overload=-2.0,
-    margin=0.4,
 )
 CONFIG = GraspConfig(
     finger_force=(1.0, 7.0),
     max_force=10.0,
-    force_per_torque=19.0,
     push_probability=0.02,
     push_speed=0.3,
     drop_distance=0.12,
@@ -75,16 +72,14 @@ def goal_of(command):
 
 
 class TestTerms:
-    @pytest.mark.parametrize("thumb", ["loose", "track", "binary"])
+    @pytest.mark.parametrize("thumb", ["loose", "binary"])
     @pytest.mark.parametrize("value", [0.005, 0.01, 0.5, 3.0, 4.0, 9.0, 200.0, 200.5])
     def test_command_reward_of_the_thumb(self, thumb, value):
         weights = dataclasses.replace(WEIGHTS, thumb=thumb)
         contact = jnp.array([True, False, False, False, False])
         found = command_reward(jnp.full(5, value), 4.0, contact, (0.01, 200.0), 10.0, weights)
         error = (value - 4.0) / 10.0
-        match = {"loose": gauss(error, 0.4), "binary": 1.0, "track": 0.6 * gauss(error, 0.1) + 0.4 * gauss(error, 0.4)}[
-            thumb
-        ]
+        match = {"loose": gauss(error, 0.4), "binary": 1.0}[thumb]
         wanted = match / 5 if 0.01 <= value <= 200.0 else 0.0
         assert float(found) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
 
@@ -146,12 +141,14 @@ class TestReward:
             "action": -0.02 * 1.0,
             "velocity": -0.002 * 4.0,
             "drop": 0.0,
-            "overload": -2.0 * (5.0 - 4.0 - 0.4) / 10,
+            "overload": 0.0,  # 5 N are no more than 1 N above the target
         }
         for name, value in wanted.items():
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
         assert float(reward) == pytest.approx(sum(wanted.values()), rel=1e-4)
+        _, harder = task.reward(goal_of(0.5), make_moment(hand, finger_force=2 * force), jnp.zeros((), bool))
+        assert float(harder["reward/overload"]) == pytest.approx(-2.0 * (10.0 - 4.0 - 1.0) / 10)
         known = {
             "success": 1.0,
             "command": 0.5,
@@ -188,16 +185,6 @@ class TestReward:
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
 
-    def test_a_finger_whose_root_joint_does_not_pull_earns_no_torque_reward(self, hand, task):
-        force = np.zeros((5, 3))
-        force[2, 1] = 3.0
-        torque = np.zeros(12)
-        for pull, earned in ((0.0, False), (0.009, False), (0.02, True)):
-            torque[hand.root_joint] = pull
-            truth = make_moment(hand, finger_force=force, joint_torque=torque)
-            _, metrics = task.reward(goal_of(0.0), truth, jnp.zeros((), bool))
-            assert (float(metrics["reward/torque"]) > 0) == earned
-
     @pytest.mark.parametrize(
         "offset, dropped",
         [
@@ -231,19 +218,13 @@ class TestChance:
         np.testing.assert_allclose(direction.T @ direction / hit.sum(), np.eye(3) / 3, atol=0.08)
 
     def test_the_command_changes_as_often_as_configured(self, hand):
-        task = Grasp(GraspConfig(command_change=0.03), hand)
+        task = Grasp(GraspConfig(), hand)
         keys = jax.random.split(jax.random.key(1), self.KEYS)
         new = np.asarray(jax.jit(jax.vmap(lambda key: task.update(key, goal_of(2.0), None).command))(keys))
         changed = new != 2.0
-        assert changed.mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 * 0.97 / self.KEYS))
+        assert changed.mean() == pytest.approx(0.005, abs=4 * math.sqrt(0.005 / self.KEYS))
         assert 0 <= new[changed].min() and new[changed].max() < 1
-        assert new[changed].mean() == pytest.approx(0.5, abs=0.05)
-
-    def test_episodes_begin_with_any_command(self, task):
-        keys = jax.random.split(jax.random.key(3), 2000)
-        goals = jax.vmap(lambda key: task.begin(key, None))(keys)
-        assert np.histogram(goals.command, 4, (0, 1))[0].min() > 400
-        assert not np.any(goals.fixed)
+        assert new[changed].mean() == pytest.approx(0.5, abs=0.12)
 
 
 class TestRelease:
@@ -287,10 +268,6 @@ class TestEvaluationPlan:
 
 
 class TestPool:
-    def test_every_shape_has_its_share(self, grasp_env):
-        count = np.bincount(grasp_env.pool.object.shape_index, minlength=len(SHAPES))
-        assert count.tolist() == [16] * 5
-
     def test_objects_start_clear_of_the_hand(self, hand, grasp_env):
         """Distances by C MuJoCo. Links may overlap by 1 mm, which is measured at seven points of
         each capsule, so that an edge between two of them may lie up to 1 mm deeper."""
@@ -309,6 +286,7 @@ class TestPool:
         assert np.mean(links[:, 1] < -0.001) < 0.02
         gap = np.array([palm[palm[:, 0] == i, 1].min() for i in range(pool.qpos.shape[0])])
         low, high = grasp_env.config.release_gap
+        assert np.bincount(pool.object.shape_index).tolist() == [16] * 5  # every shape has its share
         assert low - 1e-5 <= gap.min() and gap.max() <= high + 1e-5
         assert np.ptp(gap) > 0.7 * (high - low)
 
@@ -316,19 +294,12 @@ class TestPool:
         pool, config = grasp_env.pool, grasp_env.config
         joints = pool.qpos[:, :12]
         assert np.all(joints >= hand.joint_lower) and np.all(joints <= hand.joint_upper)
-        curl, noise = joints - np.array(config.posture), config.posture_noise + 1e-6
+        curl, noise = joints - np.array(config.posture), 0.12 + 1e-6
         assert np.all(np.abs(curl[:, :4]) <= noise)  # thumb and splay: noise alone
         assert np.all(curl[:, 4:] >= config.curl[0] - noise)
         assert np.all(curl[:, 4:] <= config.curl[1] + noise)
         np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1.0, atol=1e-5)
-        low, high = config.release_speed
-        assert np.all((pool.qvel[:, 12] >= low) & (pool.qvel[:, 12] <= high))
-        assert not np.any(pool.qvel[:, :12])
-        for moved, most in (
-            (pool.qvel[:, 13:15], config.release_drift),
-            (pool.qvel[:, 15:], config.release_spin),
-        ):
-            assert 0.8 * most < np.max(np.abs(moved)) <= most + 1e-6
+        assert not np.any(pool.qvel)
 
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))

@@ -11,26 +11,11 @@ from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
-from dexsim.tasks.placement import clearance, palm_height
+from dexsim.tasks.placement import clearance
 
 
 def with_geoms(hand, change):
     return dataclasses.replace(hand, geoms=tuple(geom for old in hand.geoms if (geom := change(old)) is not None))
-
-
-def test_the_palms_face_is_where_its_box_ends_however_its_axes_are_named(hand):
-    """The same solid, written with its axes turned by 90 degrees."""
-    palm = hand.body_names.index(hand.palm)
-
-    def turned(geom):
-        if geom.body != palm or geom.kind != "box":
-            return geom if geom.body != palm or geom.kind != "plane" else None
-        rotation = geom.rotation @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        return dataclasses.replace(geom, size=geom.size[[1, 0, 2]], rotation=rotation.astype(np.float32))
-
-    box = with_geoms(hand, lambda geom: None if geom.body == palm and geom.kind == "plane" else geom)
-    assert palm_height(with_geoms(hand, turned)) == pytest.approx(palm_height(box))
-    assert palm_height(hand) == pytest.approx(palm_height(box), abs=1e-6)
 
 
 def test_spheres_count_and_a_hand_of_a_palm_alone_is_refused(hand):

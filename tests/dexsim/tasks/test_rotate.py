@@ -16,16 +16,15 @@ import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
-from dexsim.geometry.sdf import signed_distance
 from dexsim.hand.kinematics import forward_kinematics, tip_twist
 from dexsim.physics.config import PhysicsConfig
 from dexsim.task_spec import TurnSpec
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
-from dexsim.tasks.rotate.objects import KINDS, lowest_point, sample_turned_object, upright
+from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, upright
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import _fingerprint
-from dexsim.tasks.rotate.task import Rotate, goal_quat, goal_reward, tips_at_work
+from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
 from dexsim.touch.feel import Touch
 
 PERIOD = RotateConfig().physics.control_period
@@ -73,8 +72,8 @@ class TestGoal:
         bare = dataclasses.replace(hand, name="bare", rotate_posture=(), rotate_reference=())
         with pytest.raises(ConfigError, match=r"^hand 'bare' has no rotate: .*\[rotate\] with posture and reference$"):
             Rotate(RotateConfig(), bare)
-        with pytest.raises(ConfigError, match="12 angles, the hand 6 joints"):
-            Rotate(clear_of_palm(), dexsim.load_hand("inspire_like"))
+        with pytest.raises(ConfigError, match="12 posture angles, the hand has 6"):
+            dexsim.make("rotate_clear", hand=dexsim.load_hand("inspire_like"), backend="c")
         with pytest.raises(ConfigError, match="expected 3 numbers"):
             RotateConfig(reference=(0.0, 0.0))
 
@@ -124,14 +123,6 @@ def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
 
 
 class TestReward:
-    def test_the_composite_on_a_grid(self):
-        """1 / (|d_rot| + eps) * 1 / (1 + exp(400 (d_goal - 0.05)))"""
-        for angle in (0.0, 0.1, 0.3, 1.0, 3.1):
-            for distance in (0.0, 0.03, 0.05, 0.06, 0.09):
-                expected = 1 / (angle + 0.1) / (1 + math.exp(400 * (distance - 0.05)))
-                found = goal_reward(jnp.float32(angle), jnp.float32(distance), RotateReward())
-                np.testing.assert_allclose(found, expected, rtol=2e-4)
-
     def test_the_papers_reward_is_its_three_terms(self, hand):
         assert paper().control.last_action_encoding == "action"
         task = Rotate(paper(), hand)
@@ -152,7 +143,7 @@ class TestReward:
 
     def test_fingertips_at_work_earn_the_rest_of_the_bonus(self, task, begun):
         last, tips = 0.0, RotateReward().bonus_tips
-        half = 0.5 * RotateReward().working_duty / (1 - PERIOD / 2.0)  # less this tick, in which nothing touches
+        half = 0.5 * WORKING_DUTY / (1 - PERIOD / 2.0)  # less this tick, in which nothing touches
         cases = ((1, 1, 0, 0, 0), 1 - tips), ((1, 1, 0, 0, half), 1 - tips / 2), ((1, 1, 0, 0, 1), 1.0)
         for duty, share in cases:
             goal = dataclasses.replace(begun, duty=jnp.asarray(duty, jnp.float32), turns=jnp.int32(2))
@@ -170,26 +161,6 @@ class TestReward:
             goal = dataclasses.replace(busy, pace=jnp.float32(pace / (1 - PERIOD / 2.0)))
             _, metrics = task.reward(goal, here, jnp.bool_(False))
             np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-4)
-
-    def test_standing_still_earns_less_than_turning(self, task, begun):
-        """Else policies hold the object where their first stroke ended."""
-        still, turning = (
-            float(task.reward(begun, truth(task, object_quat=turned(0), object_spin=[spin, 0, 0]), jnp.bool_(False))[0])
-            for spin in (0.0, 0.3)
-        )
-        assert 0 < still < turning - still
-
-    def test_a_lost_object_earns_nothing(self, task, begun):
-        here = truth(task, object_quat=turned(90), object_spin=[1.0, 0, 0])
-        reward, metrics = task.reward(begun, here, jnp.bool_(True))
-        assert float(reward) == RotateReward().drop
-        assert float(metrics["slipped"]) == 1 and float(metrics["pushed_out"]) == 0
-
-    def test_tips_at_work(self):
-        duty = jnp.array([0.5, 0.0, 0.125, 0.05, 0.0])
-        np.testing.assert_allclose(tips_at_work(duty, 3, 0.25), 0.2, rtol=1e-6)
-        assert tips_at_work(jnp.full(5, 0.3), 3, 0.25) == 1
-        assert tips_at_work(duty, 4, 0.25) == 0 and tips_at_work(duty, 1, 0.25) == 1
 
     def test_the_trap_costs_by_tilt_and_by_how_far_ahead(self, hand):
         task = Rotate(RotateConfig(trap=0.5), hand)
@@ -245,9 +216,7 @@ def test_every_term_of_a_tick(weighted):
     first = moment(weighted, object_position=away)
     reward, found = weighted.reward(goal, first, jnp.bool_(False))
     terms = {
-        "goal": 2.0
-        / (math.radians(60) + WEIGHTS.epsilon)
-        / (1 + math.exp(WEIGHTS.gate_steepness * (0.05 - WEIGHTS.gate))),
+        "goal": 2.0 / (math.radians(60) + 0.1) / (1 + math.exp(400 * (0.05 - WEIGHTS.gate))),
         "bonus": 0.0,
         "spin": 3.0 * 0.6,
         "action": -0.5 * 0.6**2,
@@ -299,13 +268,6 @@ def test_the_means_are_over_the_ticks_of_the_episode(weighted):
         assert float(found[name]) == pytest.approx(value, rel=1e-3, abs=1e-5), name
     pace = 0.5 * PERIOD / 2.0 * (1 - PERIOD / 2.0)  # below `bonus_speed`: the whole bonus
     assert float(found["reward/bonus"]) == pytest.approx(100.0) and pace < 0.1
-
-
-@pytest.mark.parametrize(("spin", "paid"), [(0.5, 1.5), (2.0, 3.0), (-0.5, -1.5), (-9.0, -3.0)])
-def test_turning_is_paid_up_to_one_radian_a_second_and_back_turns_cost(weighted, spin, paid):
-    goal = weighted.begin(jax.random.key(0), None)
-    _, found = weighted.reward(goal, moment(weighted, object_spin=[spin, 0, 0]), jnp.bool_(False))
-    assert float(found["reward/spin"]) == pytest.approx(paid)
 
 
 def test_a_touch_is_recent_for_a_fifth_of_a_second(weighted):
@@ -396,30 +358,6 @@ class TestDrop:
             assert bool(task.dropped(goal, truth(task, object_position=place))) == lost
 
 
-class TestObjects:
-    @pytest.mark.parametrize("kind", list(KINDS))
-    def test_touch_sees_the_object_that_is_meant(self, kind):
-        """Distances along the axis and across it: the sides of a cube, the rim of a cylinder."""
-        config = RotateConfig(object=kind, edge=(0.05, 0.05))
-        shape = sample_turned_object(jax.random.key(0), config).shape()
-        angles = np.radians(np.arange(0, 360, 45))
-        ring = 0.1 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], -1)
-        reach = {
-            "cube": np.where(np.arange(8) % 2, 0.05 / math.sqrt(2), 0.025),
-            "cylinder": np.full(8, 0.025),
-            "octagon": np.full(8, 0.05 / math.sqrt(2)),
-        }[kind]
-        np.testing.assert_allclose(signed_distance(jnp.asarray(ring), shape), 0.1 - reach, atol=1e-6)
-        np.testing.assert_allclose(signed_distance(jnp.array([0.1, 0, 0]), shape), 0.075, atol=1e-6)
-
-    def test_inertia_of_a_cube(self):
-        config = RotateConfig()
-        config = dataclasses.replace(config, objects=dataclasses.replace(config.objects, inertia_scale=(1.0, 1.0)))
-        target = sample_turned_object(jax.random.key(1), config)
-        edge = 2 * float(target.size[0, 0])
-        np.testing.assert_allclose(target.inertia, np.full(3, float(target.mass) * edge**2 / 6), rtol=1e-5)
-
-
 class TestPool:
     def test_start_states_rest_where_they_should(self, hand, monkeypatch, tmp_path):
         monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
@@ -456,7 +394,7 @@ class TestPool:
             corners = half * CORNERS
             turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
             low = (turn * slot).apply(corners)[:, 0].min() + pool.qpos[k, 12]
-            assert low > palm_height(hand) + config.clearance - 1e-6
+            assert low > palm_height(hand) + 0.001 - 1e-6
             assert np.arccos(turn.apply(axis) @ axis) < 0.35
 
     @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
@@ -471,7 +409,7 @@ class TestPool:
         key, config = jax.random.key(0), RotateConfig()
         changes = (
             *({"posture": (0.1,) * 12}, {"turn": TurnSpec(axis=(0.0, 1.0, 0.0))}, {"turn": TurnSpec(distance=0.02)}),
-            *({"edge": (0.05, 0.055)}, {"object": "cylinder"}, {"support": "fingers"}, {"tilt": 0.1}, {"trap": 0.2}),
+            *({"edge": (0.05, 0.055)}, {"support": "fingers"}, {"tilt": 0.1}, {"trap": 0.2}),
             *({"squeeze": (0.0, 0.1)}, {"pool_size": 64}),
         )
         names = {_fingerprint(key, hand, RotateConfig(**change)) for change in ({}, *changes)}
@@ -480,40 +418,19 @@ class TestPool:
         same = dataclasses.replace(config, reward=RotateReward(bonus=1.0), episode_seconds=5.0)
         assert _fingerprint(key, hand, same) in names
 
-    def test_motors_are_part_of_a_pool_and_ranges_about_them_are_not(self, hand):
-        """Objects settle under the nominal stiffness and damping: a pool from disk must have been made with them."""
-        key, config = jax.random.key(0), RotateConfig()
 
-        def named(**changes):
-            ranges = dataclasses.replace(config.randomization, **changes)
-            return _fingerprint(key, hand, dataclasses.replace(config, randomization=ranges))
-
-        names = {named(), named(stiffness=6.0), named(damping=0.3)}
-        assert len(names) == 3
-        assert named(stiffness_factor=(0.5, 2.0), scale=0.5) in names
-
-    @pytest.mark.slow
-    def test_no_start_state_is_one_clear_line(self, hand, monkeypatch, tmp_path):
-        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-        config = RotateConfig(tilt=1.2, reference=(0.3, 0.0, 0.3), support="fingers", pool_size=4)
-        told = r"only 0 of 4 objects have a start state that stayed in the hand \(\d+ tried\)"
-        with pytest.raises(ConfigError, match=told):
-            Rotate(config, hand).make_pool(jax.random.key(0))
-
-
-class TestObservation:
-    def test_fingertip_twist_against_finite_differences(self, hand):
-        rng = np.random.default_rng(0)
-        joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
-        with double_precision():
-            twist = np.asarray(jax.jit(lambda q, v: tip_twist(hand, q, v))(joints, speed))
-            pose = jax.jit(lambda q: forward_kinematics(hand, q))
-            poses = [jax.tree.map(np.asarray, pose(joints + s * speed * 1e-6)) for s in (-1, 1)]
-        linear = (poses[1].tip_position - poses[0].tip_position) / 2e-6
-        np.testing.assert_allclose(twist[:, :3], linear, atol=1e-5)
-        turn = [Rotation.from_matrix(np.asarray(p.tip_rotation)) for p in poses]
-        angular = (turn[1] * turn[0].inv()).as_rotvec() / 2e-6
-        np.testing.assert_allclose(twist[:, 3:], angular, atol=1e-4)
+def test_fingertip_twist_against_finite_differences(hand):
+    rng = np.random.default_rng(0)
+    joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
+    with double_precision():
+        twist = np.asarray(jax.jit(lambda q, v: tip_twist(hand, q, v))(joints, speed))
+        pose = jax.jit(lambda q: forward_kinematics(hand, q))
+        poses = [jax.tree.map(np.asarray, pose(joints + s * speed * 1e-6)) for s in (-1, 1)]
+    linear = (poses[1].tip_position - poses[0].tip_position) / 2e-6
+    np.testing.assert_allclose(twist[:, :3], linear, atol=1e-5)
+    turn = [Rotation.from_matrix(np.asarray(p.tip_rotation)) for p in poses]
+    angular = (turn[1] * turn[0].inv()).as_rotvec() / 2e-6
+    np.testing.assert_allclose(twist[:, 3:], angular, atol=1e-4)
 
 
 class TestReport:

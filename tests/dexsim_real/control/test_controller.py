@@ -57,7 +57,7 @@ class FakePhysics:
     def tip_stiffness(self, *arguments):
         return jnp.ones(5)
 
-    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta):
+    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta, held):
         joints, velocity = state.qpos[:12], state.qvel[:12]
         torque = law(jnp.asarray(5), joints, velocity)
         velocity = torque * 2.0

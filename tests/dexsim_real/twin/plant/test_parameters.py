@@ -29,7 +29,7 @@ def _lookup(config, path):
 
 def trained_bands(task):
     """Those that training has; the others are the emulated hand's own."""
-    return {name: band for name, band in bands(task).items() if band.sides != "within"}
+    return {name: band for name, band in bands(task).items() if band.origin and band.sides != "within"}
 
 
 def test_fingertips_and_friction_follow_nothing_of_training():
