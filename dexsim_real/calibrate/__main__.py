@@ -37,7 +37,7 @@ _SPEED = 2.0  # rad/s, largest rate of change of the commands: no motion here ne
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
-    """Run the press procedure; returns its log.
+    """Run the press procedure; returns its log. `bench` replaces port and clock (`Bench`).
 
     Raises:
       HandError: the procedure failed; the motors are off.

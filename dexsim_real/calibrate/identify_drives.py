@@ -23,9 +23,9 @@ from dexsim.identification.joint import JointLog
 from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.read import Mark, Source, read_same
+from dexsim_real.calibrate.read import Source, read_logs
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import LogError
+from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
 from dexsim_real.wire import frames
 from dexsim_real.wire.identity import check_identity
@@ -113,7 +113,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
                 for label, targets in signals.items():
                     work.move(targets[name][0])
                     for target in targets[name]:
-                        measured = work.step(target, {}) is not None  # An angle that cannot be true is none.
+                        measured = work.step(target) is not None  # An angle that cannot be true is none.
                         work.annotate({"joint": name, "signal": label, "measured": measured})
         finally:  # A signal that comes just before this line is followed by the close of the bench.
             work.close()
@@ -122,41 +122,39 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 
 def read_joints(
     paths: Iterable[Path], hand: Hand, calibration: Calibration | None
-) -> tuple[Source, dict[str, dict[str, list[Mark]]]]:
+) -> tuple[Source, dict[str, dict[str, list[dict[str, Any]]]]]:
     """How logs of one hand were recorded, and the exchanges by joint and signal; a joint is taken from its last log.
 
     Raises:
       LogError: not a log of an identification, or of another hand or configuration than the logs before.
       HandError: the calibration is of another hand.
     """
-    recorded: dict[str, dict[str, list[Mark]]] = {}
-
-    def use(source: Source, entries: list[Mark | dict[str, Any]]) -> None:
-        own: dict[str, dict[str, list[Mark]]] = {}
-        for entry in entries:
-            if isinstance(entry, Mark):
-                signals = own.setdefault(entry.content["joint"], {label: [] for label in _SIGNALS})
-                signals[entry.content["signal"]].append(entry)
-        recorded.update(own)
-
-    source = read_same(paths, TASK, use)
+    source, logs = read_logs(paths, TASK)
     if calibration is not None:
         check_identity(source.identity, hand, calibration)
+    recorded: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for records in logs:
+        own: dict[str, dict[str, list[dict[str, Any]]]] = {}
+        for mark in (record.content for record in records if record.kind == Kind.TICK):
+            own.setdefault(mark["joint"], {label: [] for label in _SIGNALS})[mark["signal"]].append(mark)
+        recorded |= own
     return source, recorded
 
 
-def joint_log(name: str, marks: list[Mark], hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
+def joint_log(
+    name: str, marks: list[dict[str, Any]], hand: Hand, source: Source, calibration: Calibration | None
+) -> JointLog:
     """The samples of a joint in one signal; without a calibration its torques are unknown.
 
     Raises:
       LogError: too many exchanges are missing, or they took longer than their period.
     """
     joint, period = hand.joint_names.index(name), 1.0 / source.rate
-    states = [mark.answer["joint"] for mark in marks if mark.answer is not None and mark.content["measured"]]
-    if len(states) < (1 - _LOST) * len(marks) or len(marks) < 2:
-        raise LogError(f"{len(marks) - len(states)} of {len(marks)} exchanges are missing; check the cable")
+    given = np.array([mark["measured"] for mark in marks], bool)
+    if given.sum() < (1 - _LOST) * len(marks) or len(marks) < 2:
+        raise LogError(f"{np.sum(~given)} of {len(marks)} exchanges are missing; check the cable")
     # The fit takes for granted that samples are a period apart.
-    time = np.array([mark.sent for mark in marks])
+    time = np.array([mark["sent"] for mark in marks])
     step, missing = np.median(np.diff(time)), time[-1] - time[0] - (len(time) - 1) * period
     if not abs(step - period) <= _OFF * period or not missing <= _LOST * len(time) * period:
         raise LogError(
@@ -165,10 +163,9 @@ def joint_log(name: str, marks: list[Mark], hand: Hand, source: Source, calibrat
         )
     # Few samples are missing: interpolate them.
     rows = np.arange(len(marks))
-    given = np.array([mark.answer is not None and mark.content["measured"] for mark in marks])
-    state = np.array(states)
+    state = np.array([frames.decode_state(mark["answer"])["joint"] for mark in marks if mark["measured"]])
     sign, offset = source.hardware.joint_sign[joint], source.hardware.joint_offset[joint]
-    command = np.array([frames.decode_command(mark.command)["position"] for mark in marks])
+    command = np.array([frames.decode_command(mark["command"])["position"] for mark in marks])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     torque = None
     if calibration is not None:

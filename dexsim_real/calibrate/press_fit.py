@@ -72,25 +72,20 @@ class Fit:
 
 
 def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
-    """Fit a calibration to all recorded presses.
-
-    Args:
-      session: the presses.
-      hand: model of the hand.
-      created: date for the calibration; None is now.
+    """Fit a calibration to all recorded presses; `created` is its date, by default now.
 
     Raises:
       CalibrationError: recordings are missing or unusable.
     """
     blocks, notes = {}, list[str]()
     for name, recording in session.recordings.items():
-        if len(recording.samples(LOADING, UNLOADING)):
-            blocks[name] = make_blocks(recording, hand.taxel_grid)
-            if blocks[name].counts.sum() <= 0:  # Without force no lever arm.
-                del blocks[name]
-                notes.append(
-                    f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current"
-                )
+        if not len(recording.samples(LOADING, UNLOADING)):
+            continue
+        part = make_blocks(recording, hand.taxel_grid)
+        if part.counts.sum() > 0:
+            blocks[name] = part
+        else:  # Without force no lever arm.
+            notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
     scale = force_scale(session, hand, [session.recordings[name] for name in blocks])
@@ -109,10 +104,10 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
-            label = hand.joint_names[joint]
-            if abs(lever[joint]) < max(MIN_LEVER, reach.get(label, 0.0)):
+            label, arm = hand.joint_names[joint], abs(lever[joint])
+            if arm < max(MIN_LEVER, reach.get(label, 0.0)):
                 continue
-            if slip[joint] > _TRUST * abs(lever[joint]):
+            if slip[joint] > _TRUST * arm:
                 notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
                 continue
             way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
@@ -123,21 +118,21 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
                     "or more often"
                 )
                 continue
-            reach[label], source[label] = abs(lever[joint]), name
+            reach[label], source[label] = arm, name
             # A force read too large makes the gain of the current too small, and leaves the lever arm.
-            known = float(np.hypot(scale.error[name], _HEAT))
-            arm = float(np.hypot(_LEVER, slip[joint]) / abs(lever[joint]))
+            known, placed = float(np.hypot(scale.error[name], _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
             real[label] = JointPress(force, part.current[:, joint], way, part.press, known)
-            sim[label] = JointPress(force, torque[:, joint], way, part.press, arm)
+            sim[label] = JointPress(force, torque[:, joint], way, part.press, placed)
         notes += _press_notes(hand, recording, dead, shear)
+    identity = session.source.identity
     try:
         calibration = calibrate(
             hand,
             real,
             sim,
             force_per_count=scale.per_count,
-            serial=session.source.identity.serial_number,
-            handedness=session.source.identity.handedness,
+            serial=identity.serial_number,
+            handedness=identity.handedness,
             created=created,
         )
     except CalibrationError as error:
@@ -153,11 +148,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
-    """Average a recording over blocks of time. An incomplete block at the end of a phase is dropped.
-
-    Args:
-      recording: of a press.
-      grid: columns and rows of the taxels.
+    """Average a recording over blocks of time, but for an incomplete block at the end of a phase.
 
     Raises:
       CalibrationError: no phase is long enough.

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
+from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.wire.frames import Mode
 

@@ -58,9 +58,7 @@ class Referee:
 
         Args:
           step: s since the last update.
-          position: [3] m of the object, palm frame.
-          quat: [4] orientation of the object, palm frame.
-          spin: [3] rad/s, angular velocity of the object, palm frame.
+          position, quat, spin: [3] m, [4], [3] rad/s of the object, palm frame.
           forces: [5] N on the fingertips: "force" whole, "normal" along the contact's normal, "taxels" on the taxels.
           joint_speed: [12] rad/s.
           at_limit: [12] bool, joints at their torque limit.
@@ -83,19 +81,16 @@ class Referee:
             for count in self.goals.values():
                 count.watch(quat, away, float(spin @ _AXIS))
         elif self.time > self.window[0]:
-            self._grip(forces)
+            # The command applies to the four fingers; the thumb balances them.
+            holding = forces["force"][1:] > _GRIP
+            if holding.any():
+                for name, force in forces.items():
+                    self._finger[name] += float(force[1:][holding].mean())
+            self._force += forces["force"]
+            self._counted += 1
             self._limited += bool(np.any(at_limit))
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
-
-    def _grip(self, forces: dict[str, np.ndarray]) -> None:
-        """Accumulate forces [5]. The command applies to the four fingers; the thumb balances them."""
-        touching = forces["force"][1:] > _GRIP
-        if touching.any():
-            for name, force in forces.items():
-                self._finger[name] += float(force[1:][touching].mean())
-        self._force += forces["force"]
-        self._counted += 1
 
     def report(self) -> dict[str, Any]:
         """Metrics so far; JSON-able.

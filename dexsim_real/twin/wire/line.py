@@ -7,12 +7,11 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from dexsim_real.core.timing import Timing
-from dexsim_real.twin.wire.faults import BYTES, Fault, Injector
+from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
@@ -24,11 +23,6 @@ PROCESSING, JITTER = 0.00120, 0.00002  # s from a request's last byte to its ans
 EXTRA_DELAY, EXTRA_PROBABILITY = 0.0011, 0.01  # s, largest extra delay of an exchange; how often there is one
 CHUNK = 510  # bytes that the adapter forwards at once
 _SILENCE = 0.003  # s without a byte after which an incomplete request is dropped
-
-
-class _Request(NamedTuple):
-    due: float  # s, when the board has received and processed it
-    frame: Frame
 
 
 class HandLine:
@@ -58,18 +52,17 @@ class HandLine:
         self.lateness = Timing()  # of the chunks of answers
         self._catch_up, self._note = catch_up, note
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
-        self._request: _Request | None = None  # that the board is receiving or processing
+        self._request: tuple[float, Frame] | None = None  # when the board has received and processed it (s)
         self._answer: deque[tuple[float, bytes]] = deque()  # when due (s), chunk
         self._back = np.inf  # s, end of a disconnection
         self._deaf = -np.inf  # s, end of a time in which requests are ignored
         self._heard = -np.inf
-        self._host_baud: int | None = BAUD
 
     def due(self) -> float:
         """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
         if self._answer:
             return min(self._answer[0][0], self._back)
-        return min(self._request.due if self._request else self.firmware.deadline, self._back)
+        return min(self._request[0] if self._request else self.firmware.deadline, self._back)
 
     def serve(self, now: float) -> None:
         """Do what is due."""
@@ -81,15 +74,13 @@ class HandLine:
             self._listen(now)
         if not self._request:  # A request that has arrived counts, even if this machine is late to serve it.
             self.firmware.watch(now)
-        elif self._request.due <= now:
-            request, self._request = self._request, None
-            self._act(now, request)
+        elif self._request[0] <= now:
+            (due, frame), self._request = self._request, None
+            self._act(now, due, frame)
         while self._answer and self._answer[0][0] <= now:
             due, chunk = self._answer.popleft()
             self.lateness.add(now - due)
             self.terminal.write(chunk)
-
-    # --- pieces ---------------------------------------------------------------------------------
 
     def _listen(self, now: float) -> None:
         data = self.terminal.read()
@@ -98,53 +89,45 @@ class HandLine:
                 self._parser.expire()
             return
         self._heard = now
-        if (baud := self.terminal.baud) not in (BAUD, None):
-            if baud != self._host_baud:
-                self._note(f"the host sends at {baud} baud, the hand at {BAUD}: set --link.baud")
-            self._host_baud = baud
-            return
+        if self.terminal.baud not in (BAUD, None):
+            return  # It understands nothing.
         for frame in self._parser.feed(data):
             self.counts["requests"] += 1
             if now < self._deaf or self._request or self._answer:  # It cannot listen and talk on one pair of wires.
                 self.counts["ignored"] += 1
             else:
-                due = now + _on_wire(len(frame.encode())) + self._delay()
-                self._request = _Request(due, frame)
+                self._request = now + _on_wire(len(frame.encode())) + self._delay(), frame
 
-    def _act(self, now: float, request: _Request) -> None:
-        """Execute a request at the time at which the palm board has received it."""
-        frame, fault = request.frame, None
-        if frame.command == Command.EXCHANGE:
-            fault = self.injector.sample(now)
-        if fault and fault.kind not in BYTES:
+    def _act(self, now: float, due: float, frame: Frame) -> None:
+        """Execute a request that the palm board has received at `due`, with at most one fault."""
+        fault = self.injector.sample(now) if frame.command == Command.EXCHANGE else None
+        kind = fault.kind if fault else ""
+        if fault and kind not in BYTES:
             self._note(f"fault {fault}")
-        if fault and fault.kind == "disconnect":
+        if fault and kind == "disconnect":
             self._back = now + fault.seconds
             self.terminal.close()
             self._parser.expire()
             return
-        if fault and fault.kind == "stall":
+        if fault and kind == "stall":
             self.counts["ignored"] += 1
             self._deaf = now + fault.seconds
             return
-        if fault and fault.kind in BYTES and fault.side == "request":  # The board does not recognise it.
+        if fault and kind in BYTES and fault.side == "request":  # The board does not recognise it.
             self.counts["damaged requests"] += 1
             return
-        if fault and fault.kind not in (*BYTES, "late"):
+        if fault and kind not in (*BYTES, "late"):
             self.firmware.begin(fault, now)
         self._catch_up(now)
-        if answer := self.firmware.answer(frame, now):
-            self._reply(now, request, answer.encode(), fault)
-
-    def _reply(self, now: float, request: _Request, data: bytes, fault: Fault | None) -> None:
+        answer = self.firmware.answer(frame, now)
+        if answer is None:
+            return
+        data = answer.encode()
         # From when it was due: a late machine catches up during the transfer.
-        start = max(request.due, now - _on_wire(len(data)) / 2)
-        damaged = False
-        if fault and fault.kind == "late":
-            start += fault.seconds
-        elif fault and fault.kind in BYTES:
-            data, damaged = self.injector.damage(fault, data), True
-        self.counts["damaged answers" if damaged else "answers"] += 1
+        start = max(due, now - _on_wire(len(data)) / 2) + (fault.seconds if fault and kind == "late" else 0.0)
+        if kind in BYTES:
+            data = self.injector.damage(kind, data)
+        self.counts["damaged answers" if kind in BYTES else "answers"] += 1
         for at in range(0, len(data), CHUNK):
             chunk = data[at : at + CHUNK]
             self._answer.append((start + _on_wire(at + len(chunk)), chunk))

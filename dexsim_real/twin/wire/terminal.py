@@ -57,7 +57,6 @@ class Terminal:
 
     @property
     def connected(self) -> bool:
-        """Whether the terminal is connected."""
         return self._master >= 0
 
     @property
