@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("serial")
-from twin_line import Running
+from twin_pair import Running
 from twin_plant import ScriptedPlant
 
 from dexsim_real.core.errors import HandError
