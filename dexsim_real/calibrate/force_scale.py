@@ -61,8 +61,8 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
             whole, in_run = (
                 fit_finger(TaxelPress(gauge, np.maximum(part, 0.0)[:, None])) for part in (counts.sum(-1), shown)
             )
-        except CalibrationError as error:
-            raise CalibrationError(f"{press.name}, gauge: {error}") from None
+        except CalibrationError as failure:
+            raise CalibrationError(f"{press.name}, gauge: {failure}") from None
         newtons[press.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
         share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
         error[press.name] = float(np.hypot(share, _GAUGE))

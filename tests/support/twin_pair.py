@@ -1,4 +1,4 @@
-"""An emulated hand for tests: on a cable in memory in virtual time, with and without the bridge's driver; in a thread."""
+"""An emulated hand for tests: on a cable in memory in virtual time, with or without a driver; in a thread."""
 
 import threading
 from types import SimpleNamespace

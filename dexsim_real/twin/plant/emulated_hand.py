@@ -326,9 +326,9 @@ class EmulatedHand:
             self._next_trial()
 
     def _assist(self) -> None:
-        before, command = self.stage, self._command
-        on = command is not None and np.all(command["mode"] == Mode.POSITION)
-        targets = command["position"].astype(float) if on else None
+        before, command, targets = self.stage, self._command, None
+        if command is not None and np.all(command["mode"] == Mode.POSITION):
+            targets = command["position"].astype(float)
         stage = self._assistant.watch(self.time, targets, self._joints, self._place_is_clear)
         if stage is Stage.FREE and before is Stage.HOLD:
             put(self._scene, self._data, *self._place)

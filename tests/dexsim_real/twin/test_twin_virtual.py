@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from emulated_plant import free
 from paths import ROOT
-from twin_plant import ScriptedPlant
 
 from dexsim.calibration.maps import current_from_counts, normalised_torque
 from dexsim.registry import make_task
