@@ -40,23 +40,17 @@ def test_options_that_do_not_go_together(tmp_path):
             arguments(tmp_path, **options)
 
 
-@pytest.mark.slow
-def test_nothing_is_overwritten(hand, session, tmp_path):
+def test_nothing_is_overwritten_and_a_figure_that_fails_leaves_the_calibration(hand, session, tmp_path):
     options, path = arguments(tmp_path), tmp_path / "hand.toml"
     path.write_text("precious")
     with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(session[2]))} fits these"):
         fit_and_report(options, hand, [session[2]], operator())  # It came while the hand was pressing.
     assert path.read_text() == "precious"
-    fit_and_report(arguments(tmp_path, force=True), hand, [session[2]], operator())
-    assert load_calibration(path, hand).joint_names == hand.joint_names
-
-
-def test_a_figure_that_cannot_be_written_leaves_the_calibration(hand, session, tmp_path):
     (tmp_path / "file").touch()
-    options = arguments(tmp_path, plot=tmp_path / "file" / "hand.png")
     with pytest.raises(OSError, match="file"):
+        options = arguments(tmp_path, force=True, plot=tmp_path / "file" / "hand.png")
         fit_and_report(options, hand, [session[2]], operator())
-    assert load_calibration(options.output, hand).joint_names == hand.joint_names
+    assert load_calibration(path, hand).joint_names == hand.joint_names
 
 
 def command(*options):

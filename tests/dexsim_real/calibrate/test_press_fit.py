@@ -76,16 +76,14 @@ def test_the_force_over_the_root_joints_torque_comes_back(hand, session):
     assert abs(float(force) - 6.0) < friction * 1.3 + 0.3
 
 
-def test_file_and_terminal_name_hand_and_limits(hand, session):
+def test_the_calibration_names_its_hand_and_dead_taxels(hand, session):
     _, options, _, shown = session
     calibration = load_calibration(options.output, hand)
     assert (calibration.serial, calibration.handedness) == ("2R32BENCH", "right")
-    notes = "\n".join(calibration.notes)
-    assert "ring_joint1: not recorded" in notes and "error of the force sensor" in notes and "% low" in notes
     # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
+    notes = "\n".join(calibration.notes)
     assert "index: dead: column 4 row 4 read" in notes and "column 9 row 2" not in notes
-    assert "Nm / A" in shown and "index side" in shown and f"calibration: {options.output}" in shown
-    assert options.plot.stat().st_size > 20_000
+    assert "index side" in shown and options.plot.stat().st_size > 20_000
 
 
 def test_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
@@ -227,22 +225,6 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     recording.shear = list(np.outer(sums, [0.0, 20.0]))
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
         fit(session, hand)
-
-
-class Slanted(BenchHand):
-    """Every taxel reads one count along x."""
-
-    def state(self):
-        block = super().state()
-        block["tip"]["taxel"]["x"] = 1
-        return block
-
-
-@pytest.mark.slow
-def test_shear_that_is_there_at_rest_is_none(hand, tmp_path):
-    log = record(Slanted(hand, plates(hand, "index pad")), hand, arguments(tmp_path, sides=False))
-    presses = read_presses([log], hand)
-    np.testing.assert_array_equal(presses.recordings["index pad"].shear, 0.0)
 
 
 # --- the scale -------------------------------------------------------------------------------
