@@ -52,6 +52,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
     logs = arguments.from_log or (record(arguments, hand, operator, **bench),)
     results, failed = [], dict[str, DexsimError]()
     source, recorded = read_joints(logs, hand, calibration)
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     for name, signals in recorded.items():
         if arguments.joints and name not in arguments.joints:
             continue
@@ -65,7 +66,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 "damping": DAMPING,
                 "stall_torque": float(hand.torque_limit[joint]),
                 "no_load_speed": float(hand.speed_limit[joint]),
-                "inertia": float(_inertia(hand)[joint]),
+                "inertia": float(model.dof_M0[model.joint(name).dofadr[0]]),  # kg m^2
             }
             result = identify(
                 log,
@@ -179,9 +180,3 @@ def _open_posture(hand: Hand) -> np.ndarray:
     posture = np.full(hand.num_joints, 0.5)
     posture[:4] = 0.5, 0.4, 0.5, 0.0
     return np.clip(posture, hand.joint_lower, hand.joint_upper)
-
-
-def _inertia(hand: Hand) -> np.ndarray:
-    """Inertia [J] kg m^2 about the joints in the model."""
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    return np.array([model.dof_M0[model.joint(name).dofadr[0]] for name in hand.joint_names])

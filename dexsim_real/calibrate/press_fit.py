@@ -99,8 +99,12 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
         high = force > 0.5 * force.max()
         lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
-        shear = _shear_share(counts, part.shear)
-        slip = shear * _shear_lever(hand, part.position[high].mean(0), recording.finger, counts)
+        # Shear over normal force by the taxels, and the torque by it over the force.
+        sums = counts.sum(-1)
+        firm = sums > 0.5 * sums.max()
+        shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
+        posture, weight = np.float32(part.position[high].mean(0)), np.float32(counts.sum(0) / counts.sum())
+        slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
@@ -162,9 +166,7 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
             names.append(phase[first])
             runs.append(np.array([np.arange(size) + at for at in starts]))
     if not runs:
-        raise CalibrationError(
-            f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
-        )
+        raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
     time, angle = np.array(recording.time), np.array(recording.position)
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
@@ -188,11 +190,8 @@ def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarra
     All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
     fingertip is the sum over its taxels, as in simulation.
     """
-    rows = [
-        _torque(hand, np.int32(finger), np.float32(at), np.float32(push))
-        for at, push in zip(position, force, strict=True)
-    ]
-    return np.array(rows, float)
+    samples = zip(np.float32(position), np.float32(force), strict=True)
+    return np.array([_torque(hand, np.int32(finger), at, push) for at, push in samples], float)
 
 
 @functools.partial(jax.jit, static_argnames="hand")
@@ -202,21 +201,9 @@ def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> j
     return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
 
 
-def _shear_share(counts: np.ndarray, shear: np.ndarray) -> float:
-    """Shear over normal force by the taxels, at high force."""
-    sums = counts.sum(-1)
-    high = sums > 0.5 * sums.max()
-    return float(np.median(np.linalg.norm(shear[high], axis=-1) / sums[high]))
-
-
-def _shear_lever(hand: Hand, position: np.ndarray, finger: int, counts: np.ndarray) -> np.ndarray:
-    """Largest lever arms [J] m of a force along the skin at the centre of the counts [B, N], at joint angles [J]."""
-    at, weight = jnp.asarray(position, jnp.float32), jnp.asarray(counts.sum(0) / counts.sum(), jnp.float32)
-    return np.asarray(_along_skin(hand, jnp.int32(finger), at, weight))
-
-
 @functools.partial(jax.jit, static_argnames="hand")
 def _along_skin(hand: Hand, finger: jax.Array, at: jax.Array, weight: jax.Array) -> jax.Array:
+    """Largest lever arms [J] m of a force along the skin at the weighted taxels, at joint angles [J]."""
     normal = weight @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
     way = jax.jacfwd(lambda q: weight @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
     along = (normal / jnp.linalg.norm(normal)) @ way

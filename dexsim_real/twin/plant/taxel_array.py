@@ -75,7 +75,9 @@ class EmulatedTaxels:
                 normal = weight * float(np.linalg.norm(contact.normal))
                 pressed += normal
                 dragged += weight * contact.tangent
-                near += normal * _around(contact.point, taxels)
+                square = ((taxels - contact.point) ** 2).sum(-1)
+                around = np.exp(-(square - square.min()) / (2 * _SPREAD**2))
+                near += normal * (around / around.sum())
             if not self._by_point:
                 near = self._squeeze(shape, (taxels - place) @ turn) * self._area[finger]
             share = near / (near.sum() or 1.0)
@@ -107,10 +109,3 @@ class EmulatedTaxels:
         depth = self._parameters.rubber - shape.distance(points)
         squeeze = np.clip(depth / self._parameters.skin_thickness, 0.0, 1 - _LEFT)
         return squeeze / (1.0 - squeeze)
-
-
-def _around(point: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-    """Share [N] of each taxel in the load of a contact at `point` [3] m."""
-    square = ((taxels - point) ** 2).sum(-1)
-    share = np.exp(-(square - square.min()) / (2 * _SPREAD**2))
-    return share / share.sum()

@@ -21,7 +21,7 @@ OVERHEATED, ABANDONED = 1, 4
 VERSION, SERIAL, HANDEDNESS = "1.3.9 emulated", "2R32EMULATED", "right"
 FORCE_PER_COUNT = 0.1  # N of one taxel count
 SHUTDOWN = 95.0  # degC at which a motor goes off until it is 10 K cooler
-_REGISTERS = {SERIAL_NUMBER: SERIAL, SIDE: HANDEDNESS}
+_REGISTERS = {SERIAL_NUMBER.to_bytes(2, "little"): SERIAL, SIDE.to_bytes(2, "little"): HANDEDNESS}
 _PALM, _TIP = 38, 31  # degC of palm board and fingertips
 _TICK = 2 * np.pi / 4096  # rad, resolution of the encoders
 _ID, _PARAMETER, _MODE, _FORCE_MODE = 1, 30, 67, 81  # numbers of refusals
@@ -92,8 +92,8 @@ class Firmware:
                 data = self._exchange(frame.data, now)
             elif asked == Command.VERSION:
                 data = VERSION.encode()
-            elif asked == Command.READ_REGISTER:
-                data = self._register(frame.data)
+            elif asked == Command.READ_REGISTER and frame.data[:2] in _REGISTERS:
+                data = frame.data[:2] + _REGISTERS[frame.data[:2]].encode().ljust(32, b"\0")
             else:
                 raise _Refusal(_PARAMETER)
             self.counts[asked.name.lower()] += 1
@@ -158,13 +158,6 @@ class Firmware:
         self._command(block)
         self.angles = _angles(measured)
         return self.state(measured).tobytes()
-
-    def _register(self, data: bytes) -> bytes:
-        """Two bytes of number and 32 of content."""
-        number = int.from_bytes(data[:2], "little")
-        if number not in _REGISTERS:
-            raise _Refusal(_PARAMETER)
-        return data[:2] + _REGISTERS[number].encode().ljust(32, b"\0")
 
     def _lasting(self, kind: str) -> list[Fault]:
         return [fault for _, fault in self.faults if fault.kind == kind]

@@ -96,7 +96,9 @@ class HandLine:
             if now < self._deaf or self._request or self._answer:  # It cannot listen and talk on one pair of wires.
                 self.counts["ignored"] += 1
             else:
-                self._request = now + _on_wire(len(frame.encode())) + self._delay(), frame
+                extra = self._rng.uniform(0.0, EXTRA_DELAY) if self._rng.random() < EXTRA_PROBABILITY else 0.0
+                delay = max(PROCESSING + JITTER * self._rng.standard_normal(), 0.0) + extra
+                self._request = now + _on_wire(len(frame.encode())) + delay, frame
 
     def _act(self, now: float, due: float, frame: Frame) -> None:
         """Execute a request that the palm board has received at `due`, with at most one fault."""
@@ -131,11 +133,6 @@ class HandLine:
         for at in range(0, len(data), CHUNK):
             chunk = data[at : at + CHUNK]
             self._answer.append((start + _on_wire(at + len(chunk)), chunk))
-
-    def _delay(self) -> float:
-        rng = self._rng
-        extra = rng.uniform(0.0, EXTRA_DELAY) if rng.random() < EXTRA_PROBABILITY else 0.0
-        return max(PROCESSING + JITTER * rng.standard_normal(), 0.0) + extra
 
 
 def _on_wire(size: int) -> float:
