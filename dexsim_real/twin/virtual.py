@@ -232,13 +232,12 @@ class VirtualRun:
             self._cycle()
         policy.begin()
         until = port.time + self.plant.limit + _SLACK
-        self._ticked = 0
         self._tick()
         port.every(self.controller.period, port.time + self.controller.period, self._tick)
         while self.plant.trial == trial and port.time < until:
-            ticked = self._ticked
+            ticks = policy.ticks
             self._cycle()
-            if self._ticked != ticked:
+            if policy.ticks != ticks:
                 yield
 
     def _cycle(self) -> None:
@@ -246,7 +245,6 @@ class VirtualRun:
         self.loop.pace.wait()
 
     def _tick(self) -> None:
-        self._ticked += 1
         newest = self.policy.tick(self.port.time)
         if newest is not None and self.trace is not None:
             self.trace.append({"time": self.port.time, "tick": newest.tick, "measured": newest.sample.measured})
