@@ -17,7 +17,7 @@ from dexsim.calibration.maps import load_calibration
 from dexsim_real.calibrate import person
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.options import PressConfig
-from dexsim_real.calibrate.report import torque_constants
+from dexsim_real.calibrate.press_fit import torque_constants
 
 
 def torque_of(plant, joint):

@@ -18,9 +18,8 @@ from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.force_scale import dead_taxels, fill_dead, force_scale, upright
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_fit import fit, torque_constant_intervals, torque_constants
 from dexsim_real.calibrate.read import PressSession, Recording, Source, read_presses
-from dexsim_real.calibrate.report import torque_constant_intervals, torque_constants
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.identity import Identity

@@ -22,10 +22,9 @@ from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.person import Gauge, Operator, parse_reading
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_fit import fit, torque_constants
 from dexsim_real.calibrate.procedure import PressProcedure, check_steady
 from dexsim_real.calibrate.read import read_presses
-from dexsim_real.calibrate.report import torque_constants
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogReader
