@@ -103,7 +103,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         sums = counts.sum(-1)
         firm = sums > 0.5 * sums.max()
         shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
-        posture, weight = np.float32(part.position[high].mean(0)), np.float32(counts.sum(0) / counts.sum())
+        posture, weight = (v.astype(np.float32) for v in (part.position[high].mean(0), counts.sum(0) / counts.sum()))
         slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
@@ -190,7 +190,7 @@ def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarra
     All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
     fingertip is the sum over its taxels, as in simulation.
     """
-    samples = zip(np.float32(position), np.float32(force), strict=True)
+    samples = zip(position.astype(np.float32), force.astype(np.float32), strict=True)
     return np.array([_torque(hand, np.int32(finger), at, push) for at, push in samples], float)
 
 
