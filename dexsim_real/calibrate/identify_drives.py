@@ -31,6 +31,8 @@ from dexsim_real.wire import frames
 from dexsim_real.wire.identity import check_identity
 
 TASK = "identify"
+Marks = list[dict[str, Any]]
+"""Annotated exchanges of one joint and signal, in the order of time."""
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
 _SIGNALS: dict[str, dict[str, Any]] = {
     "fit": {},
@@ -97,8 +99,11 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
       HandError: the procedure failed, or the hand did not answer; the motors are off.
     """
     period = 1.0 / arguments.rate
+    posture = np.full(hand.num_joints, 0.5)  # rad, about which every joint can move without a collision
+    posture[:4] = 0.5, 0.4, 0.5, 0.0
+    posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     signals = {
-        label: excitation(hand, Excitation(period=period, **options), _open_posture(hand), arguments.joints or None)
+        label: excitation(hand, Excitation(period=period, **options), posture, arguments.joints or None)
         for label, options in _SIGNALS.items()
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
@@ -123,7 +128,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 
 def read_joints(
     paths: Iterable[Path], hand: Hand, calibration: Calibration | None
-) -> tuple[Source, dict[str, dict[str, list[dict[str, Any]]]]]:
+) -> tuple[Source, dict[str, dict[str, Marks]]]:
     """How logs of one hand were recorded, and the exchanges by joint and signal; a joint is taken from its last log.
 
     Raises:
@@ -133,18 +138,16 @@ def read_joints(
     source, logs = read_logs(paths, TASK)
     if calibration is not None:
         check_identity(source.identity, hand, calibration)
-    recorded: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    recorded: dict[str, dict[str, Marks]] = {}
     for records in logs:
-        own: dict[str, dict[str, list[dict[str, Any]]]] = {}
+        own: dict[str, dict[str, Marks]] = {}
         for mark in (record.content for record in records if record.kind == Kind.TICK):
             own.setdefault(mark["joint"], {label: [] for label in _SIGNALS})[mark["signal"]].append(mark)
         recorded |= own
     return source, recorded
 
 
-def joint_log(
-    name: str, marks: list[dict[str, Any]], hand: Hand, source: Source, calibration: Calibration | None
-) -> JointLog:
+def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
     """The samples of a joint in one signal; without a calibration its torques are unknown.
 
     Raises:
@@ -173,10 +176,3 @@ def joint_log(
         current = state["current"].astype(float) * calibration.current_per_count
         torque = np.interp(rows, rows[given], np.array(joint_torque(calibration, current))[:, joint])
     return JointLog(period, target, np.interp(rows, rows[given], position), torque, name)
-
-
-def _open_posture(hand: Hand) -> np.ndarray:
-    """A posture [J] rad about which every joint can move without a collision."""
-    posture = np.full(hand.num_joints, 0.5)
-    posture[:4] = 0.5, 0.4, 0.5, 0.0
-    return np.clip(posture, hand.joint_lower, hand.joint_upper)

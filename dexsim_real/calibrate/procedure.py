@@ -112,7 +112,7 @@ class PressProcedure:
         for cycle in range(self.config.cycles):
             self._load(speed)
             speed = max(self._advance, 0.01) / self.config.seconds
-            self._unload(speed)
+            self._seek(self._touch, -speed, UNLOADING)  # until it is almost free
             self._aim(_LEAN[cycle % len(_LEAN)])
         # Typing readings takes long, so the sides use the scale of the pads.
         if self.gauge is not None and (self.gauge.automatic or placement.name.endswith("pad")):
@@ -195,13 +195,6 @@ class PressProcedure:
         self._direction = np.zeros(self.hand.num_joints)
         self._direction[joints] = way * advance / advance.max()
 
-    def _unload(self, speed: float) -> None:
-        """Retract until the fingertip is almost free."""
-        while self._advance > -_CLEARANCE:
-            exchange = self._step(-speed, UNLOADING)
-            if exchange is not None and self._force(exchange) <= self._touch:
-                return
-
     def _climb(self, gauge: Gauge, speed: float) -> None:
         """Hold rising and falling forces, and read the gauge at each."""
         levels, pause = self.bench.arguments.levels, self.config.pause
@@ -218,14 +211,15 @@ class PressProcedure:
             if force is not None:
                 self.bench.annotate({**mark, "gauge": force})
 
-    def _seek(self, force: float, speed: float) -> None:
+    def _seek(self, force: float, speed: float, phase: str = "") -> None:
         """Advance or retract until the force is passed, or a limit is reached."""
-        while True:
-            exchange = self._step(speed)
+        end = _TRAVEL if speed > 0 else -_CLEARANCE
+        while (end - self._advance) * speed > 0:
+            exchange = self._step(speed, phase)
             if exchange is None:
                 continue
             over = (self._force(exchange) - force) * math.copysign(1.0, speed)
-            if over >= 0 or self._overloaded(exchange) or not -_CLEARANCE < self._advance < _TRAVEL:
+            if over >= 0 or (speed > 0 and self._overloaded(exchange)):
                 return
 
     def _back_off(self) -> None:
