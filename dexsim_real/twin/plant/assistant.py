@@ -139,13 +139,13 @@ class Assistant:
 
     def __init__(self, task: str, patience: float = 15.0):
         self._posture, self._patience, self.reaction = np.array(POSTURES[task]), patience, 0.0
-        self.begin(0.0)
+        self.begin()
 
-    def begin(self, time: float) -> None:
-        """Take the object away at a time in s, and wait for the hand."""
-        self.stage, self._since, self._on = Stage.AWAY, time, False
-        self._held: float | None = None  # s, since when an impatient assistant holds the object
-        self._left: float | None = None  # s, when the targets left the start posture
+    def begin(self) -> None:
+        """Take the object away, and wait for the hand."""
+        self.stage = Stage.AWAY
+        self._since: float | None = None  # s, when the motors came on: from then on patience counts
+        self._release: tuple[float, float] | None = None  # s, the object is let go this long after this time
 
     def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, is_clear: Callable[[], bool]) -> Stage:
         """Update the stage.
@@ -158,19 +158,18 @@ class Assistant:
         if self.stage is Stage.FREE:
             return self.stage
         if targets is None:
-            self.begin(time)
+            self.begin()
             return self.stage
-        if not self._on:  # Patience counts while the motors are on.
-            self._on, self._since = True, time
+        self._since = time if self._since is None else self._since
         off = np.max(np.abs(targets - self._posture))
         if self.stage is Stage.AWAY:
             if off < _ARRIVED and np.max(np.abs(joints - self._posture)) < _NEAR:
-                self.stage, self._held = Stage.HOLD, None
+                self.stage = Stage.HOLD
             elif time - self._since > self._patience and is_clear():
-                self.stage, self._held = Stage.HOLD, time
-        elif self._held is not None:
-            self.stage = Stage.FREE if time - self._held > _HAND_OVER else Stage.HOLD
-        elif off > _LEFT or self._left is not None:
-            self._left = time if self._left is None else self._left
-            self.stage = Stage.FREE if time - self._left >= self.reaction else Stage.HOLD
+                self.stage, self._release = Stage.HOLD, (time, _HAND_OVER)
+            return self.stage
+        if self._release is None and off > _LEFT:
+            self._release = time, self.reaction
+        if self._release is not None and time - self._release[0] >= self._release[1]:
+            self.stage = Stage.FREE
         return self.stage

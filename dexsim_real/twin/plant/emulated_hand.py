@@ -201,7 +201,7 @@ class EmulatedHand:
 
     def _next_trial(self) -> None:
         self.trial += 1
-        self._assistant.begin(self.time)
+        self._assistant.begin()
         if self._finished:
             return
         rng = np.random.default_rng([self.seed, self.trial])
