@@ -14,24 +14,11 @@ from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.wire.faults import Fault
 from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
+from dexsim_real.wire.frames import Command, Frame, Mode
 
 
 def ask(board, kind, data=b"", now=0.0, target=0x80):
     return board.answer(Frame(0xFE, target, kind, data), now)
-
-
-def test_what_the_bridge_asks_is_answered_in_a_form_that_it_believes():
-    board, parser = Firmware(ScriptedPlant()), Parser(HAND_REPLIES)
-    for kind, data in (
-        (Command.EXCHANGE, command().tobytes()),
-        (Command.VERSION, b""),
-        (Command.READ_REGISTER, b"\x15\x00"),
-    ):
-        answer = ask(board, kind, data)
-        (read,) = parser.feed(answer.encode())
-        assert read == answer and (read.source, read.target, read.command) == (0x80, 0xFE, kind)
-    assert ask(board, Command.VERSION).data.startswith(b"1.3.9") and read.data.startswith(b"\x15\x00" + b"2R32")
 
 
 def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
