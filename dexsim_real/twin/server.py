@@ -16,8 +16,7 @@ from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
 from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import Firmware
-from dexsim_real.twin.wire.line import HandLine
-from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.twin.wire.line import HandLine, Terminal
 
 _EVENTS = 20_000  # kept for the report
 

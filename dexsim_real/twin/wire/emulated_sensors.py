@@ -16,7 +16,7 @@ from dexsim_real.sensors.camera import CameraConfig, camera_axes, encode_mask
 from dexsim_real.sensors.imu import UPRIGHT_X, encode
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import Primitive, matrix, product, turn
-from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.twin.wire.line import Terminal
 
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 PICTURE = (640, 480)  # px, columns and rows

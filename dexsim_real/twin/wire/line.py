@@ -5,15 +5,20 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 9.60 ms, 95 % below 9.63 ms, maximum 10.7 ms).
 """
 
+import contextlib
+import os
+import termios
+import tty
 from collections import Counter, deque
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.timing import Timing
 from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
-from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Parser
 from dexsim_real.wire.link import BITS_PER_BYTE
@@ -23,6 +28,76 @@ PROCESSING, JITTER = 0.00120, 0.00002  # s from a request's last byte to its ans
 EXTRA_DELAY, EXTRA_PROBABILITY = 0.0011, 0.01  # s, largest extra delay of an exchange; how often there is one
 CHUNK = 510  # bytes that the adapter forwards at once
 _SILENCE = 0.003  # s without a byte after which an incomplete request is dropped
+_RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+
+
+class Terminal:
+    """A pseudo-terminal that can be disconnected and reconnected. `name` is a link to the current terminal.
+
+    Args:
+      link: path of the link.
+
+    Raises:
+      HandError: the path exists and is not a link to a terminal like this one, or no terminal can be created.
+    """
+
+    def __init__(self, link: Path):
+        self.name = Path(link)
+        self._master = self._slave = -1
+        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
+        if self.name.exists() and not ours:
+            raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
+        self.open()
+
+    def open(self) -> None:
+        """Connect: create a terminal and the link to it."""
+        try:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            # Renamed into place, so that the link changes atomically.
+            fresh = self.name.with_name(f".{self.name.name}.{os.getpid()}")
+            fresh.symlink_to(os.ttyname(self._slave))
+            fresh.replace(self.name)
+        except OSError as error:
+            self.close()
+            raise HandError(
+                f"{self.name}: no pseudo-terminal can be created here ({error.strerror}); choose another path"
+            ) from None
+
+    def close(self) -> None:
+        """Disconnect: programs that have the terminal open get an error."""
+        if self.connected:
+            with contextlib.suppress(OSError):
+                if os.readlink(self.name) == os.ttyname(self._slave):
+                    self.name.unlink()
+            os.close(self._master)
+            os.close(self._slave)
+        self._master = self._slave = -1
+
+    @property
+    def connected(self) -> bool:
+        return self._master >= 0
+
+    @property
+    def baud(self) -> int | None:
+        """Baud rate set by the other side; None if unknown."""
+        return _RATES.get(termios.tcgetattr(self._slave)[5])
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        """Received bytes; empty if there are none."""
+        try:
+            return os.read(self._master, 65536)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; what nobody reads is lost, as on a wire."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
 
 
 class HandLine:
