@@ -87,21 +87,18 @@ def test_it_offers_a_calibration_of_this_hand_and_ends_in_good_order_when_it_is_
     waiting.communicate()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
+    (tmp_path / "there").touch()
+    for options, says in (
         ("--faults 5,melt", "give a time in s or a percentage"),
         ("--task juggle", "choose from grasp, rotate"),
         ("--watchdog 20", "between 0 and 10"),
-        ("--link FOLDER/no/port", "no pseudo-terminal"),
-        ("--task grasp --mask-socket FOLDER/no/m", "socket for masks cannot be created"),
-        ("--task grasp --mask-socket FOLDER/there", "remove the file"),
-    ],
-)
-def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch, options, message):
-    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
-    (tmp_path / "there").touch()
-    words = [word.replace(",", " ").replace("FOLDER", str(tmp_path)) for word in options.split()]
-    with pytest.raises(DexsimError, match=message) as error:
-        twin_command.main([*words, "--no-realtime"])
-    assert "\n" not in str(error.value)
+        (f"--link {tmp_path}/no/port", "no pseudo-terminal"),
+        (f"--task grasp --mask-socket {tmp_path}/no/m", "socket for masks cannot be created"),
+        (f"--task grasp --mask-socket {tmp_path}/there", "remove the file"),
+    ):
+        words = [word.replace(",", " ") for word in options.split()]
+        with pytest.raises(DexsimError, match=says) as error:
+            twin_command.main([*words, "--no-realtime"])
+        assert "\n" not in str(error.value)
