@@ -13,10 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from dexsim import load_hand
-from dexsim.calibration.maps import save_calibration
+from dexsim.calibration.maps import Calibration, save_calibration
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
@@ -25,10 +27,9 @@ from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Gauge, Operator
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_fit import Fit, fit, torque_constant_intervals, torque_constants
 from dexsim_real.calibrate.procedure import PressProcedure
 from dexsim_real.calibrate.read import read_presses
-from dexsim_real.calibrate.report import force_table, grouped, table
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
@@ -37,7 +38,7 @@ _SPEED = 2.0  # rad/s, largest rate of change of the commands: no motion here ne
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
-    """Run the press procedure; returns its log.
+    """Run the press procedure; returns its log. `bench` replaces port and clock (`Bench`).
 
     Raises:
       HandError: the procedure failed; the motors are off.
@@ -86,6 +87,46 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     if arguments.plot:
         plot_calibration(arguments.plot, result.calibration, result.real, result.sim)
         operator.tell(f"figure: {arguments.plot}")
+
+
+def table(fit: Fit) -> Table:
+    """A table with one row per joint. A cell has loading / unloading, or the worse of the two."""
+    calibration, real = fit.calibration, fit.calibration.real
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
+    width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
+    heads = ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "max force")
+    rows = Table(*heads, box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading")
+    for joint, name in enumerate(calibration.joint_names):
+        rows.add_row(
+            name,
+            fit.source.get(name, "(others)"),
+            " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
+            f"{100 * width[joint]:.1f} %",
+            f"{np.min(real.r_squared[:, joint]):.3f}",
+            f"{np.max(real.condition[:, joint]):.1f}",
+            f"{1e3 * real.friction[joint]:.0f} mA",
+            f"{real.force_max[joint]:.1f} N",
+        )
+    return rows
+
+
+def force_table(calibration: Calibration) -> Table:
+    """A table of the forces per root-joint torque; a finger that was not pressed has those of the hand's TOML."""
+    title = "fingertip force over root-joint torque"
+    rows = Table("finger", "N / Nm", "95 %", box=None, padding=(0, 1, 0, 0), title=title)
+    assert calibration.force_per_torque is not None, "`press_fit.fit` gives it"
+    for name, (value, low, high) in zip(calibration.finger_names, calibration.force_per_torque.T, strict=True):
+        rows.add_row(name, *((f"{value:.2f}", f"{low:.2f} to {high:.2f}") if value else ("(hand's TOML)", "")))
+    return rows
+
+
+def grouped(notes: tuple[str, ...]) -> list[str]:
+    """Notes, with equal notes on several joints joined."""
+    joined: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        joined.setdefault(text if colon else note, []).append(name if colon else "")
+    return [f"{', '.join(names)}: {text}" if names[0] else text for text, names in joined.items()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -22,8 +22,6 @@ from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.loop import Exchange, ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame
 from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.link import HandPort, greet
 from dexsim_real.wire.serial_hand import open_port
@@ -38,9 +36,6 @@ class Bench(ExchangeLoop):
     an exchange and returns its result. The taxels' zeros stay as they were tared: what they read is measured.
 
     Args:
-      arguments: options of the command.
-      hand: model of the hand.
-      operator: is told what happens.
       task: "calibrate" or "identify", written to the log with the configuration.
       port: replaces the port that the arguments name.
       clock, sleep: replace those of `time`, for simulated time.
@@ -65,13 +60,12 @@ class Bench(ExchangeLoop):
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log"))
         safety = Safety(hand, arguments.safety, self._react)
         super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, clock=clock, sleep=sleep)
-        self._recording = False
+        self._newest: dict[str, Any] = {}  # the last exchange, as the log has it
         self._failing_since: float | None = None
         self._connection: int | None = None
-        self._number = 0
 
     def __enter__(self) -> "Bench":
-        arguments = self.arguments
+        arguments, hand = self.arguments, self.sensing.hand
         try:
             # Only during the procedure: long computations in a real-time thread would starve the machine.
             if arguments.realtime:
@@ -79,8 +73,8 @@ class Bench(ExchangeLoop):
             for line in greet(self.port):
                 self._say(line)
             identity = getattr(self.port, "identity", None)
-            calibration = load_calibration(arguments.calibration, self.sensing.hand) if arguments.calibration else None
-            for line in check_identity(identity, self.sensing.hand, calibration):
+            calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
+            for line in check_identity(identity, hand, calibration):
                 self._say(line)
             meta = {
                 "task": self._task,
@@ -121,7 +115,7 @@ class Bench(ExchangeLoop):
 
         Args:
           target: [J] rad, requested joint targets; None keeps the last ones.
-          mark: the exchange is logged; once it is answered, with this annotation.
+          mark: annotation with which an exchange that is not None is logged.
 
         Raises:
           HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
@@ -129,13 +123,10 @@ class Bench(ExchangeLoop):
         now = self.clock()
         if target is not None:
             self.safety.set_target(target, now)
-        self._recording = mark is not None
         decision, command = self.request()
-        self._number += 1
-        self._record(Kind.SENT, command, now)
         exchange = self.take(decision, self.port.exchange(command))
-        if exchange is not None:
-            self._record(Kind.RECEIVED, exchange.state, exchange.sample.time)
+        answer = b"" if exchange is None else exchange.state.tobytes()
+        self._newest = {"sent": now, "command": command.tobytes(), "answer": answer}
         self._check(now, exchange)
         self.pace.wait()
         if exchange is None or not exchange.plausible:
@@ -144,18 +135,14 @@ class Bench(ExchangeLoop):
             self.annotate(mark)
         return exchange
 
-    def annotate(self, content: dict[str, Any]) -> None:
-        """Annotate the newest exchange in the log."""
-        self.log.add(Kind.TICK, {"sequence": self._number, **content}, self.clock())
+    def annotate(self, mark: dict[str, Any]) -> None:
+        """Log the newest exchange with an annotation."""
+        self.log.add(Kind.TICK, mark | self._newest, self.clock())
 
     def collect(
         self, seconds: float, target: np.ndarray | None = None, mark: dict[str, Any] | None = None
     ) -> list[Exchange]:
-        """The answered exchanges of this duration in s; `target` and `mark` as for `step`.
-
-        Raises:
-          HandError: see `step`; or none was answered.
-        """
+        """The answered exchanges of this duration in s; arguments and errors as for `step`, or none was answered."""
         until, exchanges = self.clock() + seconds, []
         while self.clock() < until:
             exchanges.append(self.step(target, mark))
@@ -176,11 +163,7 @@ class Bench(ExchangeLoop):
         self.step()  # What `Safety` has seen so far was not tared.
 
     def await_motors(self) -> None:
-        """Turn the motors on, and wait until they are.
-
-        Raises:
-          HandError: see `step`.
-        """
+        """Turn the motors on, and wait until they are."""
         self.engage()
         while not self.safety.anchor:
             self.step()
@@ -194,23 +177,16 @@ class Bench(ExchangeLoop):
             self.step(smooth(start, goal, share))
         self.step(goal)
 
-    def _record(self, kind: Kind, block: np.ndarray, when: float) -> None:
-        """Log a frame as it is on the wire of a hand with id 0."""
-        if self._recording:
-            ends = frames.HOST, frames.palm_address(0)
-            source, target = ends if kind == Kind.SENT else ends[::-1]
-            frame = Frame(source, target, Command.EXCHANGE, block.tobytes())
-            self.log.add(kind, (self._number, frame.encode()), when)
-
     def _check(self, now: float, exchange: Exchange | None) -> None:
         safety = self.safety
         if safety.latched:
             raise HandError(f"stopped: {safety.latched}")
         if self.log.failure:
             raise HandError(f"stopped: the log is lost ({self.log.failure})")
-        if exchange is not None and self._connection not in (None, exchange.sample.generation):
-            raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
-        self._connection = exchange.sample.generation if exchange is not None else self._connection
+        if exchange is not None:
+            if self._connection not in (None, exchange.sample.generation):
+                raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
+            self._connection = exchange.sample.generation
         reaction, reason = safety.last
         working = exchange is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from dexsim.calibration.sensor import FingerFit, TaxelPress, fit_finger
+from dexsim.calibration.sensor import TaxelPress, fit_finger
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 from dexsim_real.calibrate.read import PressSession, Recording
@@ -57,7 +57,12 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
         # The fit applies this gain to sums with the dead taxels filled in.
         counts = fill_dead(hand, counts, dead_taxels(hand, counts))
         gauge = np.array([press.gauge[level] for level in levels]) / upright(hand, press.finger, counts, posture)
-        whole, in_run = (_against(gauge, part, press.name) for part in (counts.sum(-1), shown))
+        try:
+            whole, in_run = (
+                fit_finger(TaxelPress(gauge, np.maximum(part, 0.0)[:, None])) for part in (counts.sum(-1), shown)
+            )
+        except CalibrationError as failure:
+            raise CalibrationError(f"{press.name}, gauge: {failure}") from None
         newtons[press.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
         share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
         error[press.name] = float(np.hypot(share, _GAUGE))
@@ -91,23 +96,15 @@ def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -
     active = sums >= _ACTIVE
     if not active.any():
         return np.ones(len(counts))
-    normals = [_normals(hand, jnp.int32(finger), jnp.asarray(q, jnp.float32)) for q in position]
-    weights = np.maximum(counts, 0.0)
-    push = np.array([weight @ np.asarray(normal) for weight, normal in zip(weights, normals, strict=True)])
+    normals = [np.asarray(_normals(hand, finger, jnp.asarray(q, jnp.float32))) for q in position]
+    push = np.array([weight @ normal for weight, normal in zip(np.maximum(counts, 0.0), normals, strict=True)])
     push /= np.maximum(np.linalg.norm(push, axis=-1, keepdims=True), 1e-9)
     return np.where(active, push @ push[np.where(active, sums, np.inf).argmin()], 1.0)
 
 
-@functools.partial(jax.jit, static_argnames="hand")
-def _normals(hand: Hand, finger: jax.Array, position: jax.Array) -> jax.Array:
+@functools.partial(jax.jit, static_argnames=("hand", "finger"))
+def _normals(hand: Hand, finger: int, position: jax.Array) -> jax.Array:
     return taxel_normals(hand, forward_kinematics(hand, position))[finger]
-
-
-def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:
-    try:
-        return fit_finger(TaxelPress(gauge, np.maximum(counts, 0.0)[:, None]))
-    except CalibrationError as error:
-        raise CalibrationError(f"{name}, gauge: {error}") from None
 
 
 def active_taxels(counts: np.ndarray, grid: tuple[int, int]) -> np.ndarray:

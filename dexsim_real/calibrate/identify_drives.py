@@ -23,14 +23,16 @@ from dexsim.identification.joint import JointLog
 from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.read import Mark, Source, read_same
+from dexsim_real.calibrate.read import Source, read_logs
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import LogError
+from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
 from dexsim_real.wire import frames
 from dexsim_real.wire.identity import check_identity
 
 TASK = "identify"
+Marks = list[dict[str, Any]]
+"""Annotated exchanges of one joint and signal, in the order of time."""
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
 _SIGNALS: dict[str, dict[str, Any]] = {
     "fit": {},
@@ -52,6 +54,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
     logs = arguments.from_log or (record(arguments, hand, operator, **bench),)
     results, failed = [], dict[str, DexsimError]()
     source, recorded = read_joints(logs, hand, calibration)
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     for name, signals in recorded.items():
         if arguments.joints and name not in arguments.joints:
             continue
@@ -65,7 +68,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 "damping": DAMPING,
                 "stall_torque": float(hand.torque_limit[joint]),
                 "no_load_speed": float(hand.speed_limit[joint]),
-                "inertia": float(_inertia(hand)[joint]),
+                "inertia": float(model.dof_M0[model.joint(name).dofadr[0]]),  # kg m^2
             }
             result = identify(
                 log,
@@ -96,8 +99,11 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
       HandError: the procedure failed, or the hand did not answer; the motors are off.
     """
     period = 1.0 / arguments.rate
+    posture = np.full(hand.num_joints, 0.5)  # rad, about which every joint can move without a collision
+    posture[:4] = 0.5, 0.4, 0.5, 0.0
+    posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     signals = {
-        label: excitation(hand, Excitation(period=period, **options), _open_posture(hand), arguments.joints or None)
+        label: excitation(hand, Excitation(period=period, **options), posture, arguments.joints or None)
         for label, options in _SIGNALS.items()
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
@@ -113,7 +119,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
                 for label, targets in signals.items():
                     work.move(targets[name][0])
                     for target in targets[name]:
-                        measured = work.step(target, {}) is not None  # An angle that cannot be true is none.
+                        measured = work.step(target) is not None  # An angle that cannot be true is none.
                         work.annotate({"joint": name, "signal": label, "measured": measured})
         finally:  # A signal that comes just before this line is followed by the close of the bench.
             work.close()
@@ -122,41 +128,37 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 
 def read_joints(
     paths: Iterable[Path], hand: Hand, calibration: Calibration | None
-) -> tuple[Source, dict[str, dict[str, list[Mark]]]]:
+) -> tuple[Source, dict[str, dict[str, Marks]]]:
     """How logs of one hand were recorded, and the exchanges by joint and signal; a joint is taken from its last log.
 
     Raises:
       LogError: not a log of an identification, or of another hand or configuration than the logs before.
       HandError: the calibration is of another hand.
     """
-    recorded: dict[str, dict[str, list[Mark]]] = {}
-
-    def use(source: Source, entries: list[Mark | dict[str, Any]]) -> None:
-        own: dict[str, dict[str, list[Mark]]] = {}
-        for entry in entries:
-            if isinstance(entry, Mark):
-                signals = own.setdefault(entry.content["joint"], {label: [] for label in _SIGNALS})
-                signals[entry.content["signal"]].append(entry)
-        recorded.update(own)
-
-    source = read_same(paths, TASK, use)
+    source, logs = read_logs(paths, TASK)
     if calibration is not None:
         check_identity(source.identity, hand, calibration)
+    recorded: dict[str, dict[str, Marks]] = {}
+    for records in logs:
+        own: dict[str, dict[str, Marks]] = {}
+        for mark in (record.content for record in records if record.kind == Kind.TICK):
+            own.setdefault(mark["joint"], {label: [] for label in _SIGNALS})[mark["signal"]].append(mark)
+        recorded |= own
     return source, recorded
 
 
-def joint_log(name: str, marks: list[Mark], hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
+def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
     """The samples of a joint in one signal; without a calibration its torques are unknown.
 
     Raises:
       LogError: too many exchanges are missing, or they took longer than their period.
     """
     joint, period = hand.joint_names.index(name), 1.0 / source.rate
-    states = [mark.answer["joint"] for mark in marks if mark.answer is not None and mark.content["measured"]]
-    if len(states) < (1 - _LOST) * len(marks) or len(marks) < 2:
-        raise LogError(f"{len(marks) - len(states)} of {len(marks)} exchanges are missing; check the cable")
+    given = np.array([mark["measured"] for mark in marks], bool)
+    if given.sum() < (1 - _LOST) * len(marks) or len(marks) < 2:
+        raise LogError(f"{np.sum(~given)} of {len(marks)} exchanges are missing; check the cable")
     # The fit takes for granted that samples are a period apart.
-    time = np.array([mark.sent for mark in marks])
+    time = np.array([mark["sent"] for mark in marks])
     step, missing = np.median(np.diff(time)), time[-1] - time[0] - (len(time) - 1) * period
     if not abs(step - period) <= _OFF * period or not missing <= _LOST * len(time) * period:
         raise LogError(
@@ -165,26 +167,12 @@ def joint_log(name: str, marks: list[Mark], hand: Hand, source: Source, calibrat
         )
     # Few samples are missing: interpolate them.
     rows = np.arange(len(marks))
-    given = np.array([mark.answer is not None and mark.content["measured"] for mark in marks])
-    state = np.array(states)
+    state = np.array([frames.decode_state(mark["answer"])["joint"] for mark in marks if mark["measured"]])
     sign, offset = source.hardware.joint_sign[joint], source.hardware.joint_offset[joint]
-    command = np.array([frames.decode_command(mark.command)["position"] for mark in marks])
+    command = np.array([frames.decode_command(mark["command"])["position"] for mark in marks])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     torque = None
     if calibration is not None:
         current = state["current"].astype(float) * calibration.current_per_count
         torque = np.interp(rows, rows[given], np.array(joint_torque(calibration, current))[:, joint])
     return JointLog(period, target, np.interp(rows, rows[given], position), torque, name)
-
-
-def _open_posture(hand: Hand) -> np.ndarray:
-    """A posture [J] rad about which every joint can move without a collision."""
-    posture = np.full(hand.num_joints, 0.5)
-    posture[:4] = 0.5, 0.4, 0.5, 0.0
-    return np.clip(posture, hand.joint_lower, hand.joint_upper)
-
-
-def _inertia(hand: Hand) -> np.ndarray:
-    """Inertia [J] kg m^2 about the joints in the model."""
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    return np.array([model.dof_M0[model.joint(name).dofadr[0]] for name in hand.joint_names])

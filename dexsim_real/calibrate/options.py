@@ -91,22 +91,18 @@ class CalibrateArguments(Config):
         inputs = {f"--from-log {path}": path for path in self.from_log}
         cli.check_apart(outputs, inputs | {"calibration": self.calibration})
         # With another finger or joint than meant the wrong one would move.
-        for option, value in {"--fingers": self.fingers, "--gauge": self.gauge, "--plot": self.plot}.items():
-            if value and self.identify:
-                raise HandError(f"{option} is for presses: not with --identify")
-        for option, value in {"--joints": self.joints, "--dead-band": self.dead_band}.items():
-            if value and not self.identify:
-                raise HandError(f"{option} needs --identify")
-        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
+        own = {"fingers": False, "gauge": False, "plot": False, "joints": True, "dead_band": True}
+        for name, identify in own.items():
+            if getattr(self, name) and identify != self.identify:
+                raise HandError(f"--{name.replace('_', '-')} is {'only' if identify else 'not'} for --identify")
         if self.press.current >= self.safety.current:
             raise HandError(
                 f"--press.current {self.press.current:g} A must be below --safety.current {self.safety.current:g} A"
             )
         if self.press.peak >= 0.9 * self.safety.finger_force:
             raise HandError(
-                f"--press.peak {self.press.peak:g} N must be well below --safety.finger-force "
-                f"{self.safety.finger_force:g} N"
+                f"--press.peak {self.press.peak:g} N must be well below "
+                f"--safety.finger-force {self.safety.finger_force:g} N"
             )
 
     @property

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 from rich.console import Console
@@ -16,7 +16,8 @@ from rich.console import Console
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.names import find_function
 
-_UNITS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
+_READING = re.compile(r"([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*(n|g|kg|)", re.IGNORECASE)
+_NEWTONS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
 _LARGEST = 100.0  # N, largest plausible reading
 _AT_ONCE = 0.005  # s in which most functions answer; the hand goes on without an exchange meanwhile
 _SLOWEST = 10.0  # s, longest wait for a function
@@ -134,10 +135,10 @@ def parse_reading(text: str) -> float:
     Raises:
       HandError: not a number with a known unit, or more than a fingertip can press.
     """
-    match: Any = re.fullmatch(r"\s*([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*([a-zA-Z]*)\s*", text)
-    if not match or match[2].lower() not in _UNITS:
+    match = _READING.fullmatch(text.strip())
+    if not match:
         raise HandError(f"{text.strip()!r} is not a reading: type newtons, or a number with g or kg")
-    force = float(match[1].replace(",", ".")) * _UNITS[match[2].lower()]
+    force = float(match[1].replace(",", ".")) * _NEWTONS[match[2].lower()]
     if force > _LARGEST:
         raise HandError(f"{text.strip()!r} is {force:.0f} N, more than a fingertip can press; grams need a g")
     return force

@@ -38,7 +38,6 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     """All presses, pads first and the thumb's last of them.
 
     Args:
-      hand: model of the hand.
       fingers: names; all by default.
       sides: also the sides of thumb and index finger.
 
@@ -53,33 +52,25 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
     plan = []
     for finger in sorted(selected, key=lambda i: i == 0):
-        name, posture = hand.finger_names[finger], _opened(hand)
         # Bent a little more than the others.
-        if finger == 0:
-            posture[:3] = 0.3, 0.3, 0.2
-        else:
-            first = int(hand.root_joint[finger])
-            posture[first : first + 2] = 0.35, 0.2
+        first, name = int(hand.root_joint[finger]), hand.finger_names[finger]
+        bent = {0: 0.3, 1: 0.3, 2: 0.2} if finger == 0 else {first: 0.35, first + 1: 0.2}
         task = f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it"
-        plan.append(_placement(hand, f"{name} pad", finger, middle, posture, task))
+        plan.append(_placement(hand, f"{name} pad", finger, middle, bent, task))
     for finger in [i for i in selected if sides and i in _SIDES]:
-        name, posture = hand.finger_names[finger], _opened(hand)
-        if finger == 0:
-            posture[0] = 0.4
-        else:
-            posture[3:6] = -0.1, 0.35, 0.1
+        name = hand.finger_names[finger]
+        bent = {0: 0.4} if finger == 0 else {3: -0.1, 4: 0.35, 5: 0.1}
         task = f"hold the pen across the side of the {name} that faces the {_SIDES[finger]}, 3 mm in front of it"
-        plan.append(_placement(hand, f"{name} side", finger, side, posture, task))
+        plan.append(_placement(hand, f"{name} side", finger, side, bent, task))
     return plan
 
 
-def _opened(hand: Hand) -> np.ndarray:
+def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict[int, float], task: str) -> Placement:
+    """A press at the mean of these taxels; `bent` gives the angles rad of the joints that are not open."""
     posture = np.full(hand.num_joints, _OPEN)
     posture[3] = 0.0
-    return np.clip(posture, hand.joint_lower, hand.joint_upper)
-
-
-def _placement(hand: Hand, name: str, finger: int, taxels: list[int], posture: np.ndarray, task: str) -> Placement:
+    posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
+    posture[list(bent)] = list(bent.values())
     arms = np.mean([lever_arms(hand, posture, finger, taxel) for taxel in taxels], 0)
     longest = np.max(np.abs(arms))
     joints = np.flatnonzero(np.abs(arms) > _SHARE * longest)

@@ -72,25 +72,20 @@ class Fit:
 
 
 def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
-    """Fit a calibration to all recorded presses.
-
-    Args:
-      session: the presses.
-      hand: model of the hand.
-      created: date for the calibration; None is now.
+    """Fit a calibration to all recorded presses; `created` is its date, by default now.
 
     Raises:
       CalibrationError: recordings are missing or unusable.
     """
     blocks, notes = {}, list[str]()
     for name, recording in session.recordings.items():
-        if len(recording.samples(LOADING, UNLOADING)):
-            blocks[name] = make_blocks(recording, hand.taxel_grid)
-            if blocks[name].counts.sum() <= 0:  # Without force no lever arm.
-                del blocks[name]
-                notes.append(
-                    f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current"
-                )
+        if not len(recording.samples(LOADING, UNLOADING)):
+            continue
+        part = make_blocks(recording, hand.taxel_grid)
+        if part.counts.sum() > 0:
+            blocks[name] = part
+        else:  # Without force no lever arm.
+            notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
     scale = force_scale(session, hand, [session.recordings[name] for name in blocks])
@@ -104,15 +99,19 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
         high = force > 0.5 * force.max()
         lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
-        shear = _shear_share(counts, part.shear)
-        slip = shear * _shear_lever(hand, part.position[high].mean(0), recording.finger, counts)
+        # Shear over normal force by the taxels, and the torque by it over the force.
+        sums = counts.sum(-1)
+        firm = sums > 0.5 * sums.max()
+        shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
+        posture, weight = (v.astype(np.float32) for v in (part.position[high].mean(0), counts.sum(0) / counts.sum()))
+        slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
-            label = hand.joint_names[joint]
-            if abs(lever[joint]) < max(MIN_LEVER, reach.get(label, 0.0)):
+            label, arm = hand.joint_names[joint], abs(lever[joint])
+            if arm < max(MIN_LEVER, reach.get(label, 0.0)):
                 continue
-            if slip[joint] > _TRUST * abs(lever[joint]):
+            if slip[joint] > _TRUST * arm:
                 notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
                 continue
             way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
@@ -123,21 +122,21 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
                     "or more often"
                 )
                 continue
-            reach[label], source[label] = abs(lever[joint]), name
+            reach[label], source[label] = arm, name
             # A force read too large makes the gain of the current too small, and leaves the lever arm.
-            known = float(np.hypot(scale.error[name], _HEAT))
-            arm = float(np.hypot(_LEVER, slip[joint]) / abs(lever[joint]))
+            known, placed = float(np.hypot(scale.error[name], _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
             real[label] = JointPress(force, part.current[:, joint], way, part.press, known)
-            sim[label] = JointPress(force, torque[:, joint], way, part.press, arm)
+            sim[label] = JointPress(force, torque[:, joint], way, part.press, placed)
         notes += _press_notes(hand, recording, dead, shear)
+    identity = session.source.identity
     try:
         calibration = calibrate(
             hand,
             real,
             sim,
             force_per_count=scale.per_count,
-            serial=session.source.identity.serial_number,
-            handedness=session.source.identity.handedness,
+            serial=identity.serial_number,
+            handedness=identity.handedness,
             created=created,
         )
     except CalibrationError as error:
@@ -153,11 +152,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
-    """Average a recording over blocks of time. An incomplete block at the end of a phase is dropped.
-
-    Args:
-      recording: of a press.
-      grid: columns and rows of the taxels.
+    """Average a recording over blocks of time, but for an incomplete block at the end of a phase.
 
     Raises:
       CalibrationError: no phase is long enough.
@@ -171,9 +166,7 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
             names.append(phase[first])
             runs.append(np.array([np.arange(size) + at for at in starts]))
     if not runs:
-        raise CalibrationError(
-            f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
-        )
+        raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
     time, angle = np.array(recording.time), np.array(recording.position)
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
@@ -197,11 +190,8 @@ def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarra
     All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
     fingertip is the sum over its taxels, as in simulation.
     """
-    rows = [
-        _torque(hand, np.int32(finger), np.float32(at), np.float32(push))
-        for at, push in zip(position, force, strict=True)
-    ]
-    return np.array(rows, float)
+    samples = zip(position.astype(np.float32), force.astype(np.float32), strict=True)
+    return np.array([_torque(hand, np.int32(finger), at, push) for at, push in samples], float)
 
 
 @functools.partial(jax.jit, static_argnames="hand")
@@ -211,21 +201,9 @@ def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> j
     return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
 
 
-def _shear_share(counts: np.ndarray, shear: np.ndarray) -> float:
-    """Shear over normal force by the taxels, at high force."""
-    sums = counts.sum(-1)
-    high = sums > 0.5 * sums.max()
-    return float(np.median(np.linalg.norm(shear[high], axis=-1) / sums[high]))
-
-
-def _shear_lever(hand: Hand, position: np.ndarray, finger: int, counts: np.ndarray) -> np.ndarray:
-    """Largest lever arms [J] m of a force along the skin at the centre of the counts [B, N], at joint angles [J]."""
-    at, weight = jnp.asarray(position, jnp.float32), jnp.asarray(counts.sum(0) / counts.sum(), jnp.float32)
-    return np.asarray(_along_skin(hand, jnp.int32(finger), at, weight))
-
-
 @functools.partial(jax.jit, static_argnames="hand")
 def _along_skin(hand: Hand, finger: jax.Array, at: jax.Array, weight: jax.Array) -> jax.Array:
+    """Largest lever arms [J] m of a force along the skin at the weighted taxels, at joint angles [J]."""
     normal = weight @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
     way = jax.jacfwd(lambda q: weight @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
     along = (normal / jnp.linalg.norm(normal)) @ way
@@ -302,3 +280,15 @@ def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: floa
     elif np.median(left) > TOUCHED:
         notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
     return notes
+
+
+def torque_constants(calibration: Calibration) -> np.ndarray:
+    """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
+    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
+
+
+def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
+    """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
+    sides, value = (calibration.real, calibration.sim), torque_constants(calibration)
+    share = np.hypot(*(np.asarray(side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in sides))
+    return value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])

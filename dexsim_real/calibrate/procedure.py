@@ -1,7 +1,7 @@
 """The press procedure: check and tare at rest, then press each fingertip on something firm, slowly.
 
-Every exchange is logged with its press and phase. `dexsim_real.calibrate.press_fit` reads the log, so an immediate fit
-and a later one give the same result.
+Samples are logged with their press and phase. `dexsim_real.calibrate.press_fit` reads the log, so an immediate fit and
+a later one give the same result.
 """
 
 import dataclasses
@@ -86,19 +86,17 @@ class PressProcedure:
         Raises:
           HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
         """
-        record = dataclasses.asdict(placement)
+        record = {"placement": dataclasses.asdict(placement)}
         for attempt in itertools.count(1):
-            self.bench.log.add(Kind.META, {"placement": record})
+            self.bench.log.add(Kind.META, record)
             try:
                 return self._press(placement)
             except MissedPress as missed:
-                self.bench.log.add(Kind.META, {"placement": record})  # Drops what was recorded of it.
+                self.bench.log.add(Kind.META, record)  # Drops what was recorded of it.
                 if self.operator.assume_yes and attempt >= _ATTEMPTS:
                     raise
                 self.operator.tell(f"  {missed}; again")
         raise AssertionError("the attempts have no end")
-
-    # --- pieces ---------------------------------------------------------------------------------
 
     def _press(self, placement: Placement) -> bool:
         self._placement = placement
@@ -114,7 +112,7 @@ class PressProcedure:
         for cycle in range(self.config.cycles):
             self._load(speed)
             speed = max(self._advance, 0.01) / self.config.seconds
-            self._unload(speed)
+            self._seek(self._touch, -speed, UNLOADING)  # until it is almost free
             self._aim(_LEAN[cycle % len(_LEAN)])
         # Typing readings takes long, so the sides use the scale of the pads.
         if self.gauge is not None and (self.gauge.automatic or placement.name.endswith("pad")):
@@ -132,11 +130,7 @@ class PressProcedure:
         self.bench.move(self._target())
 
     def _tare_in_air(self) -> None:
-        """Tare in the air where the press begins: gravity and the last press have moved the zero.
-
-        Raises:
-          HandError: the hand did not answer, something touches a fingertip, or a taxel is stuck.
-        """
+        """Tare in the air where the press begins: gravity and the last press have moved the zero."""
         pause, target = self.config.pause, self._target()
         self.bench.collect(pause, target)
         self.bench.set_zero(self.bench.collect(pause, target))
@@ -201,13 +195,6 @@ class PressProcedure:
         self._direction = np.zeros(self.hand.num_joints)
         self._direction[joints] = way * advance / advance.max()
 
-    def _unload(self, speed: float) -> None:
-        """Retract until the fingertip is almost free."""
-        while self._advance > -_CLEARANCE:
-            exchange = self._step(-speed, UNLOADING)
-            if exchange is not None and self._force(exchange) <= self._touch:
-                return
-
     def _climb(self, gauge: Gauge, speed: float) -> None:
         """Hold rising and falling forces, and read the gauge at each."""
         levels, pause = self.bench.arguments.levels, self.config.pause
@@ -224,22 +211,19 @@ class PressProcedure:
             if force is not None:
                 self.bench.annotate({**mark, "gauge": force})
 
-    def _seek(self, force: float, speed: float) -> None:
+    def _seek(self, force: float, speed: float, phase: str = "") -> None:
         """Advance or retract until the force is passed, or a limit is reached."""
-        while True:
-            exchange = self._step(speed)
+        end = _TRAVEL if speed > 0 else -_CLEARANCE
+        while (end - self._advance) * speed > 0:
+            exchange = self._step(speed, phase)
             if exchange is None:
                 continue
             over = (self._force(exchange) - force) * math.copysign(1.0, speed)
-            if over >= 0 or self._overloaded(exchange) or not -_CLEARANCE < self._advance < _TRAVEL:
+            if over >= 0 or (speed > 0 and self._overloaded(exchange)):
                 return
 
     def _back_off(self) -> None:
-        """Free the fingertip, and check that it reads about zero.
-
-        Raises:
-          MissedPress: it reads far below zero, so it was touched when it was tared.
-        """
+        """Free the fingertip, and check that it does not read far below zero: it was touched when it was tared."""
         self._start()
         self.bench.collect(self.config.pause, self._target())
         name, finger, sensing = self._placement.name, self._placement.finger, self.bench.sensing
@@ -257,7 +241,7 @@ class PressProcedure:
         None when the hand did not answer or `Safety` held it; the advance then stays as it was.
         """
         before, self._advance = self._advance, min(self._advance + speed * self.bench.pace.period, _TRAVEL)
-        exchange = self.bench.step(self._target(), {} if phase else None)
+        exchange = self.bench.step(self._target())
         if exchange is None or exchange.decision.reaction > Reaction.CLIP:
             self._advance = before
             return None

@@ -23,13 +23,12 @@ from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.twin.wire.firmware import HANDEDNESS, SERIAL
 
 
-def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
+def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
     """The physics for the options."""
     return EmulatedHand(
         hand,

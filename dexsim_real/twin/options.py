@@ -40,7 +40,8 @@ class TwinArguments(Config):
     """Request real-time priority; continue without it if not permitted."""
     plant_model: Path | None = None
     """Third-party MJCF of the hand, which takes the place of the emulated hand's body and contacts; or a TOML that
-    names it and its parts (docs/emulated_hand.md). None for the emulated hand's own."""
+    names it and its parts (docs/emulated_hand.md). Its motors are left out: the emulated hand's drive its joints. None
+    for the emulated hand's own."""
     faults: tuple[str, ...] = ()
     """Injected faults, each "12.5 stall 0.2" (seconds after the first exchange, kind, values) or "1% flip" (share of
     the exchanges). Values that are left out are sampled. `flip|drop|duplicate answer|request`, `late|stall|disconnect

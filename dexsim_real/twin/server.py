@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
 from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import Firmware
-from dexsim_real.twin.wire.line import HandLine
-from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.twin.wire.line import HandLine, Terminal
 
 _EVENTS = 20_000  # kept for the report
 
@@ -34,7 +33,7 @@ class PlantClock:
     SLICE = 0.001  # s, simulated at once
     MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
 
-    def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
+    def __init__(self, plant: EmulatedHand, start: float, note: Callable[[str], None]):
         self.plant, self.now, self._note = plant, start, note
         self.slipped, self.cost = 0.0, 0.0  # s; computing time s of a slice
         self._noted_at = -1e9
@@ -77,7 +76,7 @@ class Twin:
     def __init__(
         self,
         arguments: TwinArguments,
-        plant: Plant,
+        plant: EmulatedHand,
         folder: Path,
         show: Callable[[str], None] = lambda text: None,
     ):
@@ -87,13 +86,9 @@ class Twin:
         self.clock = PlantClock(plant, self.start, self.note)
         self.firmware = Firmware(plant, arguments.watchdog, self.note)
         self.injector = Injector(arguments.faults, seed)
+        terminal = Terminal(arguments.link or folder / "hand")
         self.line = HandLine(
-            Terminal(arguments.link or folder / "hand"),
-            self.firmware,
-            self.injector,
-            seed=seed,
-            catch_up=self.clock.catch_up,
-            note=self.note,
+            terminal, self.firmware, self.injector, seed=seed, catch_up=self.clock.catch_up, note=self.note
         )
         self.imu: EmulatedImu | None = None
         self.masks: EmulatedCamera | None = None

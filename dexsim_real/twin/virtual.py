@@ -15,6 +15,7 @@ import numpy as np
 
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
+from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
@@ -28,11 +29,10 @@ from dexsim_real.sensors.object_sensors import ObjectSensors
 from dexsim_real.twin.plant.assistant import nominal_gravity
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
 from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.link import BITS_PER_BYTE, LinkCounts, Reply
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
@@ -42,10 +42,7 @@ _SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
 
 def ideal_calibration(hand: Hand) -> Calibration:
-    """The calibration of an emulated hand with nominal motors, the mean result of the press procedure.
-
-    The sampled errors of current and taxels in a trial are errors of this calibration.
-    """
+    """The calibration of an emulated hand with nominal motors; a trial's current and taxel errors are errors of it."""
 
     def side(gain: np.ndarray) -> Side:
         both, one = np.broadcast_to(gain, (2, hand.num_joints)).astype(float), np.ones(hand.num_joints)
@@ -64,13 +61,9 @@ def ideal_calibration(hand: Hand) -> Calibration:
 
 
 class VirtualPort:
-    """`HandPort` of an emulated hand in virtual time, and that time: `clock` and `sleep` take the place of `time`'s.
+    """`HandPort` of an emulated hand in virtual time, and that time: `clock` and `sleep` take the place of `time`'s."""
 
-    Args:
-      plant: the physics.
-    """
-
-    def __init__(self, plant: Plant):
+    def __init__(self, plant: EmulatedHand):
         self.plant, self.firmware = plant, Firmware(plant)
         self.time, self.counts, self._sequence = 0.0, LinkCounts(), 0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
@@ -131,28 +124,25 @@ class VirtualPort:
             self.time = time
 
 
-class VirtualImu(ImuReader):
-    """The IMU in the object, and the bridge's processing of it, without a port."""
+def virtual_imu(port: VirtualPort, seed: int) -> ImuReader:
+    """The bridge's reader of the IMU in the object, without a terminal."""
+    reader, frames = ImuReader(), ImuFrames(port.plant, seed)
 
-    def __init__(self, port: VirtualPort, seed: int):
-        super().__init__()
-        self._port, self._frames = port, ImuFrames(port.plant, seed)
-        port.every(1 / IMU_RATE, 0.001, self._sample)
+    def sample() -> None:
+        data = frames.sample()
+        arrival = port.time + BITS_PER_BYTE * len(data) / BAUD
+        port.at(arrival, lambda: reader.receive(arrival, data))
 
-    def _sample(self) -> None:
-        data = self._frames.sample()
-        arrival = self._port.time + 10 * len(data) / BAUD  # ten bits a byte
-        self._port.at(arrival, lambda: self.receive(arrival, data))
+    port.every(1 / IMU_RATE, 0.001, sample)
+    return reader
 
 
-class VirtualCamera(HeightSensor):
-    """The camera and the bridge's height sensor, without a socket; its pictures come when they are scheduled."""
-
-    def __init__(self, port: VirtualPort, controller: Controller):
-        spec, optics = controller.spec, CameraConfig()
-        reference = np.asarray(spec.reference, float)
-        super().__init__(lambda: None, optics, reference, spec.object_axes, spec.velocity_filter)
-        port.every(1 / CAMERA_RATE, 0.002, lambda: self.see(port.time, picture(port.plant, optics)))
+def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
+    """The bridge's height sensor, without a socket; its pictures come when they are scheduled."""
+    optics, reference = CameraConfig(), np.asarray(spec.reference, float)
+    sensor = HeightSensor(lambda: None, optics, reference, spec.object_axes, spec.velocity_filter)
+    port.every(1 / CAMERA_RATE, 0.002, lambda: sensor.see(port.time, picture(port.plant, optics)))
+    return sensor
 
 
 class Unlimited(Safety):
@@ -205,12 +195,12 @@ class VirtualRun:
         self.port = port = VirtualPort(plant)
         sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
-        self.imu = VirtualImu(port, plant.seed) if "imu" in controller.sources else None
-        self.camera = VirtualCamera(port, controller) if "camera" in controller.sources else None
+        imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
+        camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
         self.policy = PolicyLoop(
             controller,
             self.safety,
-            ObjectSensors(np.asarray(controller.spec.reference, float), self.camera, self.imu),
+            ObjectSensors(np.asarray(controller.spec.reference, float), camera, imu),
             command=command,
             approach=_APPROACH,
             place=_PLACE,
@@ -242,13 +232,12 @@ class VirtualRun:
             self._cycle()
         policy.begin()
         until = port.time + self.plant.limit + _SLACK
-        self._ticked = 0
         self._tick()
         port.every(self.controller.period, port.time + self.controller.period, self._tick)
         while self.plant.trial == trial and port.time < until:
-            ticked = self._ticked
+            ticks = policy.ticks
             self._cycle()
-            if self._ticked != ticked:
+            if policy.ticks != ticks:
                 yield
 
     def _cycle(self) -> None:
@@ -256,7 +245,6 @@ class VirtualRun:
         self.loop.pace.wait()
 
     def _tick(self) -> None:
-        self._ticked += 1
         newest = self.policy.tick(self.port.time)
         if newest is not None and self.trace is not None:
             self.trace.append({"time": self.port.time, "tick": newest.tick, "measured": newest.sample.measured})

@@ -7,29 +7,16 @@ from dexsim_real.twin.plant.assistant import Stage, put
 from dexsim_real.twin.plant.drives import Drives, Heat
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import sample_trial
-from dexsim_real.twin.plant.protocol import MotorCommands
-from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.frames import Mode, command_block
 
-QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0, "taxel_drift": 0.0}
-
-IDEAL = {
-    "coulomb_friction": 0.0,
-    "viscous_friction": 0.0,
-    "no_load_current": 0.0,
-    "efficiency": 1.0,
-    "ripple": 0.0,
-    "encoder_bias": 0.0,
-    "latency": 0.0,
-    "latency_spread": 0.0,
-    "thermal": 0.0,
-}
+QUIET = dict.fromkeys(("taxel_noise", "taxel_bias", "taxel_spread", "taxel_threshold", "taxel_drift"), 0.0)
+IDEAL = {"efficiency": 1.0} | dict.fromkeys(
+    "coulomb_friction viscous_friction no_load_current ripple encoder_bias latency latency_spread thermal".split(), 0.0
+)
 
 
-def motors(position, *, kp=100.0, ki=0.0, kd=0.0, torque_max=300.0, mode=Mode.POSITION):
-    def full(value):
-        return np.broadcast_to(np.asarray(value, float), 12).copy()
-
-    return MotorCommands(full(position), full(kp), full(ki), full(kd), full(torque_max), full(int(mode)))
+def motors(position, *, kp=100, ki=0, kd=0, torque_max=300, mode=Mode.POSITION):
+    return command_block(position, kp=kp, ki=ki, kd=kd, torque_max=torque_max, mode=mode)
 
 
 def drives(hand, heat=None, **overrides):

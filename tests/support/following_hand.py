@@ -36,31 +36,10 @@ class FollowingHand(PtyHand):
 
 def arguments(peer, folder, *more):
     """Patient with the peer, which shares this process and perhaps a busy machine."""
-    return [
-        "grasp",
-        "--port",
-        peer.port,
-        "--uncalibrated",
-        "--yes",
-        "--fixed-object",
-        "--link.settle",
-        "0",
-        "--link.no-paced",
-        "--link.margin",
-        "0.2",
-        "--safety.stale",
-        "1",
-        "--approach",
-        "0.4",
-        "--log",
-        str(folder / "run.log"),
-        "--output",
-        str(folder / "run.json"),
-        "--quiet",
-        "--no-realtime",
-        "--no-guard",
-        *more,
-    ]
+    options = "--uncalibrated --yes --fixed-object --link.settle 0 --link.no-paced --link.margin 0.2 --safety.stale 1"
+    options += " --approach 0.4 --quiet --no-realtime --no-guard"
+    files = ["--log", str(folder / "run.log"), "--output", str(folder / "run.json")]
+    return ["grasp", "--port", peer.port, *options.split(), *files, *more]
 
 
 def summary(folder):

@@ -84,16 +84,16 @@ class PressBench(EmulatedHand):
 
     def _look(self) -> None:
         """Hold the pen in front of the fingertip that is about to press."""
-        commands = self._commands
+        command = self._command
         if self._touches:
             return
-        if commands is None or not np.all(commands.mode == Mode.POSITION):
+        if command is None or not np.all(command["mode"] == Mode.POSITION):
             self._remove()
             return
-        placement = next((p for p in self._plan if self._waits(p, commands.position)), self._pressing_placement)
+        placement = next((p for p in self._plan if self._waits(p, command["position"])), self._pressing_placement)
         if placement is not None and placement is not self._pressing_placement:
             self._hold_before(placement)
-        elif self._pressing_placement is not None and self._left(commands.position):
+        elif self._pressing_placement is not None and self._left(command["position"]):
             self._remove()
 
     def _waits(self, placement: Placement, target: np.ndarray) -> bool:

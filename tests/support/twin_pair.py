@@ -1,16 +1,28 @@
-"""The bridge's driver and an emulated hand on one cable in memory, in virtual time."""
+"""An emulated hand for tests: on a cable in memory in virtual time, with or without a driver; in a thread."""
 
+import threading
 from types import SimpleNamespace
 
 from twin_plant import REST, ScriptedPlant
 
+from dexsim_real.twin.options import TwinArguments
+from dexsim_real.twin.server import Twin
 from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.line import HandLine
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import LinkConfig
 from dexsim_real.wire.serial_hand import SerialHand
+
+
+def command(position=REST, mode=Mode.POSITION):
+    return frames.command_block(position, kp=100, ki=0, kd=0, torque_max=300, mode=mode)
+
+
+def request(block=None):
+    """The bytes of an exchange."""
+    return Frame(0xFE, 0x80, Command.EXCHANGE, (command() if block is None else block).tobytes()).encode()
 
 
 class Cable:
@@ -18,9 +30,17 @@ class Cable:
 
     connected, baud = True, 3_000_000
 
-    def __init__(self):
-        self.now, self.line = 1000.0, None
+    def __init__(self, faults=(), seed=0, watchdog=0.0):
+        self.now, self.plant, self.notes = 1000.0, ScriptedPlant(), []
         self.to_hand, self.to_host = bytearray(), bytearray()
+        self.board = Firmware(self.plant, watchdog, self.notes.append)
+        self.injector = Injector(faults, seed)
+        self.line = HandLine(
+            self, self.board, self.injector, seed=seed, catch_up=self._catch_up, note=self.notes.append
+        )
+
+    def _catch_up(self, now):
+        self.plant.advance(max(now - 1000.0 - self.plant.time, 1e-6))
 
     # What the hand sees.
 
@@ -47,6 +67,18 @@ class Cable:
         while self.now < until and not enough():
             self.now = min(max(self.line.due(), self.now + 1e-6), until)
             self.line.serve(self.now)
+
+    def ask(self, data, seconds=0.03):
+        """The pieces that come after sending these bytes, with their times."""
+        self.to_hand += data
+        self.line.serve(self.now)
+        until, pieces = self.now + seconds, []
+        while self.now < until:
+            self.wait(until - self.now, lambda: self.to_host)
+            if self.to_host:
+                pieces.append((self.now, bytes(self.to_host)))
+                self.to_host.clear()
+        return pieces
 
 
 class Port:
@@ -84,47 +116,36 @@ class Port:
         pass
 
 
-class Pair:
+class Pair(Cable):
     """The bridge's driver and an emulated hand on one cable."""
 
-    def __init__(self, monkeypatch, faults=(), seed=0, watchdog=0.08, **link):
+    def __init__(self, monkeypatch, faults=(), seed=0, watchdog=0.08):
         import serial
 
-        self.cable, self.plant, self.notes = Cable(), ScriptedPlant(), []
-        cable = self.cable
-        monkeypatch.setattr(
-            "dexsim_real.wire.serial_hand.time", SimpleNamespace(monotonic=lambda: cable.now, sleep=cable.wait)
-        )
-        monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(cable, timeout))
-        self.board = Firmware(self.plant, watchdog, self.notes.append)
-        self.injector = Injector(faults, seed)
-        self.line = cable.line = HandLine(
-            cable, self.board, self.injector, seed=seed, catch_up=self._catch_up, note=self.notes.append
-        )
-        self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1), **link))
+        super().__init__(faults, seed, watchdog)
+        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.wait)
+        monkeypatch.setattr("dexsim_real.wire.serial_hand.time", clock)
+        monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(self, timeout))
+        self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1)))
         self.port.connect()
-
-    def _catch_up(self, now):
-        self.plant.advance(max(now - 1000.0 - self.plant.time, 1e-6))
 
     def exchange(self, mode=Mode.POSITION, period=0.012):
         """One exchange a cycle, as the bridge does."""
-        start = self.cable.now
-        reply = self.port.exchange(frames.command_block(REST, kp=100, ki=0, kd=0, torque_max=300, mode=mode))
-        took = self.cable.now - start
-        self.cable.wait(-took % period)
+        start = self.now
+        reply = self.port.exchange(command(mode=mode))
+        self.wait((start - self.now) % period)
         return reply
 
     def run(self, seconds):
         """Times at which answers came."""
-        until, replies = self.cable.now + seconds, []
-        while self.cable.now < until:
+        until, replies = self.now + seconds, []
+        while self.now < until:
             replies.append(self.exchange())
         return [reply.received for reply in replies if reply is not None]
 
     def settle(self):
         """Until nothing is under way any more."""
-        self.cable.wait(1.0)
+        self.wait(1.0)
         for _ in range(3):
             self.exchange(Mode.PASSIVE)
         while self.exchange(Mode.PASSIVE) is None:
@@ -133,16 +154,33 @@ class Pair:
     def agreement(self):
         """What the host counted, beside what was injected."""
         counts, line, made = self.port.counts, self.line.counts, self.injector.injected
-        damaged_answers, damaged_requests = (
-            sum(made[f"{kind} {side}"] for kind in BYTES) for side in ("answer", "request")
-        )
+        answers, requests = (sum(made[f"{kind} {side}"] for kind in BYTES) for side in ("answer", "request"))
         return {
-            "corrupt": (counts.corrupt, damaged_answers),
+            "corrupt": (counts.corrupt, answers),
             "lost": (counts.lost, made["disconnect"]),
             # What the hand never answered, and what came too late.
-            "silent": (counts.silent, damaged_requests + line["ignored"] + counts.late),
+            "silent": (counts.silent, requests + line["ignored"] + counts.late),
             "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
             "sent": (counts.sent, line["requests"]),
             "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
-            "damaged": (line["damaged answers"] + line["damaged requests"], damaged_answers + damaged_requests),
+            "damaged": (line["damaged answers"] + line["damaged requests"], answers + requests),
         }
+
+
+class Running:
+    """A twin that runs in a thread."""
+
+    def __init__(self, folder, plant=None, **options):
+        self.plant = plant or ScriptedPlant()
+        self.twin = Twin(TwinArguments(**options), self.plant, folder)
+        self.port = str(self.twin.line.terminal.name)
+        self._thread = threading.Thread(target=self.twin.run, daemon=True)
+        self._thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.twin.stop()
+        self._thread.join()
+        self.twin.close()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
+from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.wire.frames import Mode
 
@@ -21,32 +21,32 @@ class ScriptedPlant:
     """
 
     up = np.array([math.cos(0.2), 0.0, math.sin(0.2)])
+    shape = ObjectShape("box", (Primitive("box", (0.025, 0.025, 0.025)),))
 
-    def __init__(self, trial_seconds: float = math.inf, turn: float = 0.5):
+    def __init__(self, trial_seconds=math.inf, turn=0.5):
         self.trial_seconds, self.turn = trial_seconds, turn
-        self.shape = ObjectShape("box", (Primitive("box", (0.025, 0.025, 0.025)),))
         self.time, self.angle = 0.0, REST.copy()
         self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
-        self.motors: MotorCommands | None = None
-        self.orders: list[tuple[float, np.ndarray, MotorCommands]] = []  # s; rad, true angles; commands
+        self.motors = None
+        self.orders = []  # s; rad, true angles; `frames.COMMAND_BLOCK`
 
     @property
-    def trial(self) -> int:
+    def trial(self):
         return int(self.time / self.trial_seconds) if math.isfinite(self.trial_seconds) else 0
 
-    def drive(self, motors: MotorCommands) -> None:
+    def drive(self, motors):
         self.motors = motors
         self.orders.append((self.time, self.angle.copy(), motors))
 
-    def advance(self, seconds: float) -> None:
+    def advance(self, seconds):
         self.time += seconds
-        on = np.zeros(12, bool) if self.motors is None else self.motors.mode == Mode.POSITION
-        goal = np.where(on, self.motors.position, self.angle) if self.motors else self.angle
-        before = self.angle
+        before, goal = self.angle, self.angle
+        if self.motors is not None:
+            goal = np.where(self.motors["mode"] == Mode.POSITION, self.motors["position"], self.angle)
         self.angle = goal + (self.angle - goal) * math.exp(-seconds / 0.02)
         self.velocity = (self.angle - before) / seconds
 
-    def measure(self) -> PlantMeasurement:
+    def measure(self):
         force = np.zeros((5, 120, 3))
         # Quarter of a newton on ten taxels for each radian; what pulls along the tip is half of it.
         force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
@@ -67,25 +67,25 @@ class ScriptedPlant:
     def results(self):
         return [{"trial": k} for k in range(self.trial + 1)]
 
-    def violations(self, hand) -> list[str]:
+    def violations(self, hand):
         """Limits of the bridge that the commands exceeded: compared with the true angles, not the reported ones."""
         names, before = [], None
         for time, angles, motors in self.orders:
-            on, position = motors.mode != Mode.PASSIVE, motors.position
-            stays = np.zeros(12, bool) if before is None else on & (before[1].mode != Mode.PASSIVE)
+            on, position = motors["mode"] != Mode.PASSIVE, motors["position"].astype(float)
+            stays = np.zeros(12, bool) if before is None else on & (before[1]["mode"] != Mode.PASSIVE)
             away = np.abs(position - angles)
             outside = (position < hand.joint_lower - 1e-5) | (position > hand.joint_upper + 1e-5)
             names += ["range"] * bool(np.any(on & outside))
-            names += ["current limit"] * bool(np.any(on & (motors.torque_max > 400)))
+            names += ["current limit"] * bool(np.any(on & (motors["torque_max"] > 400)))
             names += ["reach"] * bool(np.any(on & (away > 0.75)))
             names += ["start"] * bool(np.any(on & ~stays & (away > 0.05)))
             if before is not None:
-                step = np.where(stays, np.abs(position - before[1].position), 0.0).max()
+                step = np.where(stays, np.abs(position - before[1]["position"]), 0.0).max()
                 names += ["speed"] * bool(step > 7.0 * (time - before[0] + SLACK))
             before = time, motors
         return names
 
 
-def make(arguments, hand) -> ScriptedPlant:
+def make(arguments, hand):
     """In place of `dexsim_real.twin.__main__.make_plant`."""
     return ScriptedPlant(arguments.seconds or math.inf)

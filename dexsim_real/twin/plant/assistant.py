@@ -28,23 +28,21 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
 are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
-MOUNT: dict[str, tuple[float, float] | None] = {"grasp": None, "rotate": (-0.2, -0.2)}
-"""Nominal pitch and roll rad of a hand mounted palm up: wrist and thumb side lowered (raised if negative). None is
-upside down."""
+MOUNT = (-0.2, -0.2)  # rad, pitch and roll of the hand that is palm up: wrist and thumb side lowered (raised)
 GRAVITY = 9.81  # m/s^2
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
 _OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
 _SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the release position
 _HAND_OVER = 0.5  # s of holding before release, for a runner that continues after a drop
+_PLACES = 60  # sampled for an object
 
 
 def nominal_gravity(task: str) -> np.ndarray:
-    """Gravity [3] m/s^2 in the palm frame of a hand with the nominal mount."""
-    mount = MOUNT[task]
-    if mount is None:
+    """Gravity [3] m/s^2 in the palm frame: upside down to grasp, palm up on a leaning mount to rotate."""
+    if task == "grasp":
         return GRAVITY * np.array([1.0, 0.0, 0.0])
-    pitch, roll = mount
+    pitch, roll = MOUNT
     return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
 
 
@@ -65,6 +63,11 @@ class Place(NamedTuple):
     position: np.ndarray  # [3] m
     quat: np.ndarray  # [4]
     velocity: np.ndarray  # [3] m/s
+
+    @property
+    def shelf(self) -> np.ndarray:
+        """Where [3] m the object waits."""
+        return self.position + _SHELF
 
 
 def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float) -> Place:
@@ -89,10 +92,10 @@ def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random
 def find_place(
     scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float
 ) -> Place | None:
-    """Sample a release pose that the hand in its start posture leaves clear; None when 60 attempts find none."""
+    """Sample a release pose that the hand in its start posture leaves clear; None if there seems to be none."""
     data = mujoco.MjData(scene.model)
     data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
-    for _ in range(60):
+    for _ in range(_PLACES):
         place = sample_place(parameters, shape, rng, face)
         if clear(scene, data, place):
             return place
@@ -136,43 +139,37 @@ class Assistant:
 
     def __init__(self, task: str, patience: float = 15.0):
         self._posture, self._patience, self.reaction = np.array(POSTURES[task]), patience, 0.0
-        self.begin(0.0)
+        self.begin()
 
-    def begin(self, time: float) -> None:
-        """Take the object away at a time in s, and wait for the hand."""
-        self.stage, self._since, self._on = Stage.AWAY, time, False
-        self._held: float | None = None
-        self._left: float | None = None
+    def begin(self) -> None:
+        """Take the object away, and wait for the hand."""
+        self.stage = Stage.AWAY
+        self._since: float | None = None  # s, when the motors came on: from then on patience counts
+        self._release: tuple[float, float] | None = None  # s, the object is let go this long after this time
 
     def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, is_clear: Callable[[], bool]) -> Stage:
         """Update the stage.
 
         Args:
           time: s.
-          targets: [12] rad, joint targets; None when the motors are off.
-          joints: [12] rad, joint angles.
+          targets, joints: [12] rad; targets are None when the motors are off.
           is_clear: tells whether the hand leaves the release pose clear.
         """
         if self.stage is Stage.FREE:
             return self.stage
         if targets is None:
-            self.begin(time)
+            self.begin()
             return self.stage
-        if not self._on:  # Patience counts while the motors are on.
-            self._on, self._since = True, time
+        self._since = time if self._since is None else self._since
         off = np.max(np.abs(targets - self._posture))
         if self.stage is Stage.AWAY:
             if off < _ARRIVED and np.max(np.abs(joints - self._posture)) < _NEAR:
-                self.stage, self._held = Stage.HOLD, None
+                self.stage = Stage.HOLD
             elif time - self._since > self._patience and is_clear():
-                self.stage, self._held = Stage.HOLD, time
-        elif self._held is not None:
-            self.stage = Stage.FREE if time - self._held > _HAND_OVER else Stage.HOLD
-        elif off > _LEFT or self._left is not None:
-            self._left = time if self._left is None else self._left
-            self.stage = Stage.FREE if time - self._left >= self.reaction else Stage.HOLD
+                self.stage, self._release = Stage.HOLD, (time, _HAND_OVER)
+            return self.stage
+        if self._release is None and off > _LEFT:
+            self._release = time, self.reaction
+        if self._release is not None and time - self._release[0] >= self._release[1]:
+            self.stage = Stage.FREE
         return self.stage
-
-    def shelf(self, place: Place) -> np.ndarray:
-        """Waiting position [3] m of the object."""
-        return place.position + _SHELF

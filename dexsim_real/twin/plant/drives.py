@@ -15,7 +15,6 @@ import dataclasses
 import numpy as np
 
 from dexsim_real.twin.plant.parameters import EXCHANGE_COMMAND, TrialParameters
-from dexsim_real.twin.plant.protocol import MotorCommands
 from dexsim_real.wire.frames import Mode
 
 STIFFNESS = 3.0 / 100  # Nm/rad per unit of kp
@@ -82,10 +81,10 @@ class Drives:
         self._apply_heat()
         self.delay = max(parameters.latency - EXCHANGE_COMMAND, 0.0) + parameters.latency_spread
 
-    def send(self, time: float, motors: MotorCommands) -> None:
-        """Queue commands that the palm board received at a time in s; the joints' boards receive them later."""
+    def send(self, time: float, command: np.ndarray) -> None:
+        """Queue a `frames.COMMAND_BLOCK` that the palm board has at a time in s; the joints' boards get it later."""
         there = time + self.delay - 1e-9
-        self._queue.append((there, np.array([getattr(motors, name) for name in _FIELDS], float)))
+        self._queue.append((there, np.array([command[name] for name in _FIELDS], float)))
         self._next = min(self._next, there.min())
 
     def step(self, time: float, rotor: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -115,12 +114,11 @@ class Drives:
 
     def _receive(self, time: float) -> None:
         """Each board takes the newest command that has reached it."""
-        for there, motors in self._queue:
-            self._board = np.where(time >= there, motors, self._board)
+        for there, command in self._queue:
+            self._board = np.where(time >= there, command, self._board)
         while self._queue and time >= self._queue[0][0].max():
             self._queue.popleft()
-        waiting = [there[there > time].min() for there, _ in self._queue]
-        self._next = min(waiting, default=np.inf)
+        self._next = min((there[there > time].min() for there, _ in self._queue), default=np.inf)
         self._on = self._board[5] == Mode.POSITION
         self._limit = self._board[4] / FULL_TORQUE_MAX * STALL_CURRENT
         self._max_torque = self._limit * self.constant
@@ -134,9 +132,8 @@ class Drives:
         error = position - encoder
         torque = self.stiffness * kp * error - self.emf * speed
         if ki.any():
-            self._integral = np.clip(
-                self._integral + PERIOD * INTEGRAL * ki * error, -self._max_torque, self._max_torque
-            )
+            more = PERIOD * INTEGRAL * ki * error
+            self._integral = np.clip(self._integral + more, -self._max_torque, self._max_torque)
             torque += self._integral
         if kd.any():  # This damping acts on the firmware's speed estimate, the back-EMF on the true speed.
             rate = speed if self._last is None else (encoder - self._last) / PERIOD

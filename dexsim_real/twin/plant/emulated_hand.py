@@ -1,10 +1,11 @@
-"""The emulated hand: a `Plant` of one trial after another, from the object in an assistant's hand to the verdict.
+"""The emulated hand: one trial after another, from the object in an assistant's hand to the verdict.
 
 C MuJoCo runs at 0.5 ms (`scene`), the firmware at 1 ms (`drives`), fingertips (`taxel_array`) and referee at 10 ms. The
 palm frame is the world frame. All follows from the seed and the commands.
 """
 
 import collections
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,6 @@ from dexsim_real.twin.plant.parameters import (
     TrialParameters,
     sample_trial,
 )
-from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
@@ -39,6 +39,18 @@ _LOOK = 0.01  # s between two samples of the fingertips, and updates of the refe
 _OBJECTS = 200  # sampled for a trial, until one has room between the fingers
 
 
+@dataclasses.dataclass(frozen=True)
+class PlantMeasurement:
+    """Readings of the emulated hand's sensors at one time, before the quantisation of the wire."""
+
+    time: float  # s since the start of the plant
+    joint_position: np.ndarray  # [12] rad, from the encoders
+    joint_velocity: np.ndarray  # [12] rad/s
+    current: np.ndarray  # [12] mA, positive when opening
+    temperature: np.ndarray  # [12] degC, of the motors
+    taxel_force: np.ndarray  # [5, 120, 3] N along x, y, z of the wire; z points into the tip
+
+
 class _Past(NamedTuple):
     """The state at one time, from which delayed sensors read."""
 
@@ -49,7 +61,7 @@ class _Past(NamedTuple):
 
 
 class EmulatedHand:
-    """A hand with an object, trial after trial.
+    """A hand with an object, trial after trial. The owner advances its time.
 
     Args:
       hand: model of the hand.
@@ -89,7 +101,7 @@ class EmulatedHand:
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
         self._skin = EmulatedTaxels(hand, by_point=self._model.foreign)
         self.time, self._ticks, self._due = 0.0, 0, 0.0
-        self._commands: MotorCommands | None = None
+        self._command: np.ndarray | None = None
         # The fingers of a hand without commands are slightly bent.
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
         self.seed, self.kind, self._end = seed, kind, None if trials is None else first + trials
@@ -99,10 +111,10 @@ class EmulatedHand:
         self.trial = first - 1
         self._next_trial()
 
-    def drive(self, motors: MotorCommands) -> None:
-        """Set new motor commands, effective from now."""
-        self._commands = motors
-        self._drives.send(self.time, motors)
+    def drive(self, command: np.ndarray) -> None:
+        """Set a new `frames.COMMAND_BLOCK`, effective from now."""
+        self._command = command
+        self._drives.send(self.time, command)
 
     def advance(self, seconds: float) -> None:
         """Simulate this duration in s; a remainder below 1 ms is kept for the next call."""
@@ -110,7 +122,6 @@ class EmulatedHand:
         while self._due >= self._period - 1e-12:
             self._due -= self._period
             self._before()
-            self._power()
             self._step()
             self._joints = self._data.qpos[self._scene.drive_qpos].copy()
             self._ticks += 1
@@ -134,7 +145,7 @@ class EmulatedHand:
             time=self.time,
             joint_velocity=past.qvel[self._scene.drive_dof],
             joint_position=encoder,
-            current=-1000.0 * current,  # positive when opening
+            current=-1000.0 * current,
             temperature=self._drives.case.copy(),
             taxel_force=self._skin.report(taxels, rng, self.time - self._began),
         )
@@ -179,7 +190,7 @@ class EmulatedHand:
         return self._assistant.stage
 
     def results(self) -> list[dict[str, Any]]:
-        """True results of all trials so far, including the current one."""
+        """True results of all trials so far, including the current one; JSON-able."""
         return [*self._done] if self._finished else [*self._done, self._report()]
 
     # --- trials ---------------------------------------------------------------------------------
@@ -190,7 +201,7 @@ class EmulatedHand:
 
     def _next_trial(self) -> None:
         self.trial += 1
-        self._assistant.begin(self.time)
+        self._assistant.begin()
         if self._finished:
             return
         rng = np.random.default_rng([self.seed, self.trial])
@@ -208,7 +219,7 @@ class EmulatedHand:
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
         self._referee = Referee(self.task, self._seconds)
-        put(scene, self._data, self._assistant.shelf(place), place.quat)
+        put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
 
@@ -236,6 +247,7 @@ class EmulatedHand:
 
     def _report(self) -> dict[str, Any]:
         left_out = STRUCTURE.keys() | (OF_THE_FILE if self._model.foreign else set())
+        values = {name: value for name, value in self.parameters.value.items() if name not in left_out}
         return {
             "trial": self.trial,
             "task": self.task,
@@ -245,11 +257,7 @@ class EmulatedHand:
             "shape": self.shape.name,
             "stage": self.stage.value,
             **self._referee.report(),
-            "parameters": {
-                name: np.round(value, 6).tolist()
-                for name, value in self.parameters.value.items()
-                if name not in left_out
-            },
+            "parameters": {name: np.round(value, 6).tolist() for name, value in values.items()},
         }
 
     # --- one firmware period --------------------------------------------------------------------
@@ -259,27 +267,37 @@ class EmulatedHand:
         if self.stage is Stage.FREE:
             self._pushes.apply(self.time, self._data.xfrc_applied[self._scene.object_body][:3])
 
-    def _power(self) -> None:
-        """Set torques and friction of the drives for the next period."""
+    def _step(self) -> None:
         scene, data = self._scene, self._data
         torque, friction = self._drives.step(self.time, data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof])
         data.qfrc_applied[scene.drive_dof] = torque
         scene.model.dof_frictionloss[scene.drive_dof] = friction
-
-    def _step(self) -> None:
-        model, data = self._scene.model, self._data
         if self.stage is Stage.FREE:
-            mujoco.mj_step(model, data, self._substeps)
+            mujoco.mj_step(scene.model, data, self._substeps)
             return
-        held = self._place.position if self.stage is Stage.HOLD else self._assistant.shelf(self._place)
+        position = self._place.position if self.stage is Stage.HOLD else self._place.shelf
         for _ in range(self._substeps):
-            put(self._scene, data, held, self._place.quat)
-            mujoco.mj_step(model, data)
+            put(scene, data, position, self._place.quat)
+            mujoco.mj_step(scene.model, data)
 
     def _remember(self) -> None:
         data, dof = self._data, self._scene.object_dof
         acceleration = data.qacc[dof : dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
         self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
+
+    def _past_state(self, age: float) -> _Past:
+        """The state `age` s ago, or the oldest one stored."""
+        return self._past[-1 - min(round(age / self._period), len(self._past) - 1)]
+
+    def _sample_skin(self) -> None:
+        scene, data, body = self._scene, self._data, self._scene.object_body
+        self._touches = tip_contacts(scene, data)
+        force = self._no_force
+        if self._touches:
+            tips = data.site_xpos[scene.tip_site], data.site_xmat[scene.tip_site].reshape(-1, 3, 3)
+            rotation = data.xmat[body].reshape(3, 3)
+            force = self._skin.load(self.shape, data.xpos[body], rotation, tips, self._touches)
+        self._samples.append((self.time, force))
 
     def _look(self) -> None:
         if self.stage is Stage.FREE:
@@ -308,8 +326,9 @@ class EmulatedHand:
             self._next_trial()
 
     def _assist(self) -> None:
-        before, commands = self.stage, self._commands
-        targets = commands.position if commands is not None and np.all(commands.mode == Mode.POSITION) else None
+        before, command, targets = self.stage, self._command, None
+        if command is not None and np.all(command["mode"] == Mode.POSITION):
+            targets = command["position"].astype(float)
         stage = self._assistant.watch(self.time, targets, self._joints, self._place_is_clear)
         if stage is Stage.FREE and before is Stage.HOLD:
             put(self._scene, self._data, *self._place)
@@ -320,30 +339,9 @@ class EmulatedHand:
         probe.qpos[:] = self._data.qpos
         return clear(self._scene, probe, self._place)
 
-    # --- sensors --------------------------------------------------------------------------------
-
-    def _past_state(self, age: float) -> _Past:
-        """The state `age` s ago, or the oldest one stored."""
-        return self._past[-1 - min(round(age / self._period), len(self._past) - 1)]
-
-    def _sample_skin(self) -> None:
-        scene, data, body = self._scene, self._data, self._scene.object_body
-        self._touches = tip_contacts(scene, data)
-        force = self._no_force
-        if self._touches:
-            tips = data.site_xpos[scene.tip_site], data.site_xmat[scene.tip_site].reshape(-1, 3, 3)
-            turn = data.xmat[body].reshape(3, 3)
-            force = self._skin.load(self.shape, data.xpos[body], turn, tips, self._touches)
-        self._samples.append((self.time, force))
-
 
 class Pushes:
-    """The pushes of one trial on its object: a constant force for a short time, at random times.
-
-    Args:
-      parameters: of the trial.
-      rng: random numbers for times and directions.
-    """
+    """The pushes of one trial on its object: a constant force for a short time, at random times and in random ways."""
 
     def __init__(self, parameters: TrialParameters, rng: np.random.Generator):
         self._parameters, self._rng = parameters, rng

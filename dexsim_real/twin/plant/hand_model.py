@@ -8,6 +8,8 @@ on the body that the finger's last joint moves. A TOML says what cannot be found
     palm = "base"                  # body or site: fingers along z, palm normal x, thumb side y
     joints = ["j0", ..., "j11"]    # in the order of the hand
     tips = ["tip_0", ..., "tip_4"] # sites at the tips, in the order of the fingers
+
+The motors are the emulated hand's in both cases.
 """
 
 import dataclasses
@@ -24,10 +26,11 @@ from dexsim_real.core.errors import HandError
 PREFIX = "plant/"  # of all names of the MJCF
 _RANGE = 0.05  # rad, largest difference of an end of a joint's range
 _APART = 0.015  # m, largest distance of a fingertip from where the hand has it
-_FREE = mujoco.mjtJoint.mjJNT_FREE
+_FREE, _HINGE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
+_IN_PAIRS = 1 << 30  # collision bit of geoms that otherwise touch by explicit pairs alone
 
 Pose = tuple[np.ndarray, np.ndarray]
-"""Position [3] m and rotation [3, 3]."""
+"""Position [..., 3] m and rotation [..., 3, 3]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,14 +66,15 @@ def own_model(hand: Hand) -> HandModel:
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     _delete(spec, *spec.actuators, *spec.sensors, *spec.keys)
     spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
-    lattices = [f"{hand.body_names[body]}_taxels" for body in hand.tip_body]
-    for name in lattices:
-        spec.body(name.removesuffix("_taxels")).add_site(name=name)
+    tips = [hand.body_names[body] for body in hand.tip_body]
+    for tip in tips:
+        spec.body(tip).add_site(name=f"{tip}_taxels")
     data = mujoco.MjData(spec.compile())
     mujoco.mj_kinematics(data.model, data)
     palm = data.body(hand.palm)
     spec = _in_palm_frame(spec, (palm.xpos, palm.xmat.reshape(3, 3)))
-    return HandModel("emulated hand", spec, _prefixed(hand.joint_names), hand.torque_limit, _prefixed(lattices))
+    lattices = _prefixed(f"{tip}_taxels" for tip in tips)
+    return HandModel("emulated hand", spec, _prefixed(hand.joint_names), hand.torque_limit, lattices)
 
 
 def read_model(path: str | Path, hand: Hand) -> HandModel:
@@ -87,6 +91,7 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     try:
         names = _Names(**tomllib.loads(path.read_text())) if path.suffix == ".toml" else _Names(path.name)
         spec = mujoco.MjSpec.from_file(str(path.parent / names.model))
+        _let_touch(spec)
         _leave_out_scenery(spec)
         model = spec.compile()
         joints = _find_joints(model, hand, names.joints)
@@ -117,12 +122,24 @@ def _prefixed(names: Iterable[str]) -> list[str]:
     return [PREFIX + name for name in names]
 
 
-# --- reading: ValueError where the file does not fit ---------------------------------------------
-
-
 def _delete(spec: mujoco.MjSpec, *elements: object) -> None:
     for element in elements:
         spec.delete(element)
+
+
+# --- reading: ValueError where the file does not fit ---------------------------------------------
+
+
+def _let_touch(spec: mujoco.MjSpec) -> None:
+    """Geoms that the file lets touch by explicit pairs alone may touch the trial's object, and as before one another.
+
+    By their affinity only: two geoms collide when the type of one is in the affinity of the other.
+    """
+    for name in {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}:
+        if (geom := spec.geom(name)) is not None and not geom.contype | geom.conaffinity:
+            geom.conaffinity = _IN_PAIRS
+    if not any(geom.contype | geom.conaffinity for geom in spec.geoms):
+        raise ValueError("no geom can touch anything: all have contype and conaffinity 0, and there are no pairs")
 
 
 def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
@@ -136,7 +153,7 @@ def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
 
 def _find_joints(model: mujoco.MjModel, hand: Hand, given: tuple[str, ...]) -> list[int]:
     """The named joints, those with the hand's names, or those with an actuator; in the order of the hand."""
-    hinges = {model.joint(j).name: j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE}
+    hinges = {model.joint(j).name: j for j in range(model.njnt) if model.jnt_type[j] == _HINGE}
     driven = [model.joint(int(joint)).name for joint in model.actuator_trnid[:, 0]]
     names = given or (hand.joint_names if set(hand.joint_names) <= hinges.keys() else tuple(driven))
     if len(set(names)) != hand.num_joints or set(names) - hinges.keys():
@@ -169,11 +186,8 @@ def _find_palm(data: mujoco.MjData, joints: list[int], given: str) -> Pose:
 
 def _carriers(model: mujoco.MjModel, body: int) -> set[int]:
     """Bodies that carry a body, up to the world."""
-    bodies = set()
-    while body:
-        body = int(model.body_parentid[body])
-        bodies.add(body)
-    return bodies
+    parent = int(model.body_parentid[body])
+    return {parent} | (_carriers(model, parent) if parent else set())
 
 
 def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, given: tuple[str, ...]) -> int:

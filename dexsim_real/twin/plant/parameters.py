@@ -38,24 +38,19 @@ class Band:
     per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
     sides: str = "both"  # possible ends: "both", "high", "low"; "within": the hand's own range, not training's
 
-    def outside(self) -> tuple[tuple[float, float], ...]:
-        """The intervals for values outside, lowest first."""
-        width = self.high - self.low
-        below = (self.low - FAR * width, self.low - NEAR * width)
-        above = (self.high + NEAR * width, self.high + FAR * width)
-        sides = {"both": (below, above), "low": (below,), "high": (above,), "within": ((self.low, self.high),)}
-        return sides[self.sides]
-
     def sample(self, rng: np.random.Generator, kind: str) -> np.ndarray:
         """Sample values of a kind in `KINDS`; the shape follows from `per`."""
-        shape = _COUNT[self.per]
+        shape, width = _COUNT[self.per], self.high - self.low
         # Every kind consumes the same random numbers, so that kinds differ in nothing else.
         side, place = rng.random(shape), rng.random(shape)
         if kind == "nominal":
             return np.full(shape, self.nominal)
         if kind == "inside":
-            return self.low + place * (self.high - self.low)
-        spans = np.array(self.outside())
+            return self.low + place * width
+        below = (self.low - FAR * width, self.low - NEAR * width)
+        above = (self.high + NEAR * width, self.high + FAR * width)
+        sides = {"both": (below, above), "low": (below,), "high": (above,), "within": ((self.low, self.high),)}
+        spans = np.array(sides[self.sides])
         low, high = spans[(side * len(spans)).astype(int)].T
         return (low + place.T * (high - low)).T
 
@@ -92,9 +87,8 @@ BANDS: dict[str, Band] = {
     "link_friction": Band(0.25, 1.0, "1", "", 0.5, sides="within"),  # plastic and painted metal
     "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
     "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
-    "rubber": Band(
-        0.0, 0.001, "m", "", 0.0005, sides="within"
-    ),  # beyond the taxels; the maker's shell is within 0.5 mm
+    # Beyond the taxels; the maker's shell is within 0.5 mm.
+    "rubber": Band(0.0, 0.001, "m", "", 0.0005, sides="within"),
 }
 """Bands of both tasks; `TASK_BANDS` adds to them or replaces them."""
 
@@ -149,7 +143,6 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
 }
 """Parameters that training does not randomise or does not model: one value for all trials."""
 
-
 OF_THE_FILE = frozenset(
     "friction link_friction stiffness_contact restitution rubber torsion rolling palm_stiffness cone_ratio".split()
 )
@@ -184,23 +177,19 @@ def sample_trial(
     """Sample the parameters of a trial.
 
     Args:
-      task: "grasp" or "rotate".
-      rng: random numbers of this trial.
-      kind: one of `KINDS`.
-      overrides: values by name, the same for all joints, fingers or axes; or a name in `KINDS` that applies to this
-        parameter.
+      overrides: by name a value, the same for all joints, fingers or axes; or one of `KINDS` for this parameter alone.
 
     Raises:
       HandError: there is no such parameter or kind.
     """
     table, given = bands(task), overrides or {}
-    for name, number in given.items():
-        if name not in table and name not in STRUCTURE:
-            names = ", ".join(sorted([*table, *STRUCTURE]))
-            raise HandError(f"the emulated hand has no parameter {name!r}; choose from {names}")
-        if isinstance(number, str) and (number not in KINDS or name not in table):
-            raise HandError(f"{name} = {number!r}: give a number, or for a sampled parameter one of {', '.join(KINDS)}")
     kinds = {name: number for name, number in given.items() if isinstance(number, str)}
+    for name, number in given.items():
+        if name not in (table if name in kinds else table | STRUCTURE):
+            names = ", ".join(sorted([*table, *STRUCTURE]))
+            raise HandError(f"the emulated hand has no parameter {name!r} to sample or set; choose from {names}")
+        if name in kinds and number not in KINDS:
+            raise HandError(f"{name} = {number!r}: give a number, or one of {', '.join(KINDS)}")
     value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}

@@ -17,6 +17,7 @@ LIMITS = {"grasp": 8.0, "rotate": 120.0}
 """Time limit in s of a trial, by task."""
 LOST = {"grasp": 0.12, "rotate": 0.07}  # m, drop radius
 GOAL_STEP, GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = math.pi / 2, 0.3, 0.05, 2.0  # rad, rad, m, rad/s
+_FASTEST = {"task": GOAL_SPIN, "paper": math.inf}  # rad/s about the axis at which a goal counts
 TIPPED = 1.0  # rad
 TOUCH = 0.1  # N above which a fingertip counts as touching (for forces of a grasp: `_GRIP`)
 _GRIP = 0.01  # N
@@ -42,7 +43,8 @@ class Referee:
         self._counted, self._limited = 0, 0
         self._force, self._duty, self._speed = np.zeros(5), np.zeros(5), 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
-        self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
+        self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
+        self._heading: float | None = None  # rad, at the release
 
     def watch(
         self,
@@ -58,9 +60,7 @@ class Referee:
 
         Args:
           step: s since the last update.
-          position: [3] m of the object, palm frame.
-          quat: [4] orientation of the object, palm frame.
-          spin: [3] rad/s, angular velocity of the object, palm frame.
+          position, quat, spin: [3] m, [4], [3] rad/s of the object, palm frame.
           forces: [5] N on the fingertips: "force" whole, "normal" along the contact's normal, "taxels" on the taxels.
           joint_speed: [12] rad/s.
           at_limit: [12] bool, joints at their torque limit.
@@ -75,27 +75,33 @@ class Referee:
             self._touched = self.time
         away = float(np.linalg.norm(position - self._reference))
         tilt = math.acos(float(np.clip(matrix(quat)[:, 0] @ _AXIS, -1.0, 1.0)))
-        if away > LOST[self.task] or (self.goals and tilt > TIPPED):
+        rotate = self.task == "rotate"
+        if away > LOST[self.task] or (rotate and tilt > TIPPED):
             pushed = self.time - self._touched <= _RECENT
             self.end = f"dropped: {'tipped' if away <= LOST[self.task] else 'pushed out' if pushed else 'slipped'}"
             return
-        if self.goals:
-            for count in self.goals.values():
-                count.watch(quat, away, float(spin @ _AXIS))
+        if rotate:
+            self._count_goals(quat, away, float(spin @ _AXIS))
         elif self.time > self.window[0]:
-            self._grip(forces)
+            # The command applies to the four fingers; the thumb balances them.
+            holding = forces["force"][1:] > _GRIP
+            if holding.any():
+                for name, force in forces.items():
+                    self._finger[name] += float(force[1:][holding].mean())
+            self._force += forces["force"]
+            self._counted += 1
             self._limited += bool(np.any(at_limit))
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
 
-    def _grip(self, forces: dict[str, np.ndarray]) -> None:
-        """Accumulate forces [5]. The command applies to the four fingers; the thumb balances them."""
-        touching = forces["force"][1:] > _GRIP
-        if touching.any():
-            for name, force in forces.items():
-                self._finger[name] += float(force[1:][touching].mean())
-        self._force += forces["force"]
-        self._counted += 1
+    def _count_goals(self, quat: np.ndarray, away: float, spin: float) -> None:
+        """Goals are 90 degrees apart about the palm's normal, from the first heading on."""
+        if self._heading is None:  # Angle of the rotation about x nearest to the orientation.
+            self._heading = 2 * math.atan2(quat[1], quat[0])
+        for name, fastest in _FASTEST.items():
+            goal = turn(_AXIS, self._heading + (self.goals[name] + 1) * GOAL_STEP)
+            apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
+            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= fastest
 
     def report(self) -> dict[str, Any]:
         """Metrics so far; JSON-able.
@@ -112,7 +118,7 @@ class Referee:
             "duty": np.round(self._duty / lived, 4).tolist(),
             "joint_speed": round(self._speed / lived, 4),
         }
-        if self.goals is None:
+        if self.task == "grasp":
             return report | {
                 "held": self.end == "time limit",
                 "force": np.round(self._force / count, 4).tolist(),
@@ -122,29 +128,8 @@ class Referee:
                 "torque_limited": round(self._limited / count, 4),
             }
         return report | {
-            "successes": self.goals["task"].count,
-            "paper_successes": self.goals["paper"].count,
+            "successes": self.goals["task"],
+            "paper_successes": self.goals["paper"],
             "seconds_to_fall": round(self.time, 4),
             "fell": self.end.startswith("dropped"),
         }
-
-
-class GoalCount:
-    """Counts consecutive goals 90 degrees apart about the palm's normal, from the first heading.
-
-    Args:
-      fastest: largest rad/s about the axis at which a goal counts.
-    """
-
-    def __init__(self, fastest: float):
-        self._fastest, self.count = fastest, 0
-        self._start: float | None = None
-
-    def watch(self, quat: np.ndarray, away: float, spin: float) -> None:
-        """Update with orientation [4], distance m from the nominal position, spin rad/s about the axis."""
-        if self._start is None:  # The heading: angle of the rotation about x nearest to the orientation.
-            self._start = 2 * math.atan2(quat[1], quat[0])
-        goal = turn((1.0, 0.0, 0.0), self._start + (self.count + 1) * GOAL_STEP)
-        apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
-        if apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= self._fastest:
-            self.count += 1

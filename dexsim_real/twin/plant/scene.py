@@ -5,9 +5,8 @@ second is the gear play: free within its gap, then stiff. Contacts are springs o
 cones; rubber fingertips also have torsional friction. A foreign hand keeps the contacts of its file.
 """
 
-import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,7 +22,7 @@ END_STOP = 300.0  # Nm/rad
 _GREASE = 0.02  # Nm s/rad, assumed viscous friction of a gear
 _STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: a sticking joint creeps by less than 1e-3 rad/s
 _FAR = 0.2  # m above the palm, where rays start
-_KINDS = {
+KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -31,21 +30,29 @@ _KINDS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
 class Scene:
     """A compiled model and its indices; J joints in the order of the hand, F fingers."""
 
-    model: mujoco.MjModel
-    drive_qpos: np.ndarray  # [J]
-    drive_dof: np.ndarray  # [J]
-    play_qpos: np.ndarray  # [J]
-    play_dof: np.ndarray  # [J]
-    object_qpos: int  # first of seven
-    object_dof: int  # first of six
-    object_body: int
-    tip_site: np.ndarray  # [F] at the frames in which the hand gives the taxels
-    finger_of_geom: np.ndarray  # [geoms] index of the fingertip, -1 for none
-    is_object: np.ndarray  # [geoms] bool
+    def __init__(self, model: mujoco.MjModel, hand: HandModel):
+        drives = [model.joint(name) for name in hand.joints]
+        plays = [model.joint(f"{name}_play") for name in hand.joints]
+        free = model.joint("object")
+        self.model = model
+        self.drive_qpos, self.drive_dof = _addresses(drives)  # each [J]
+        self.play_qpos, self.play_dof = _addresses(plays)
+        self.object_qpos, self.object_dof = int(free.qposadr[0]), int(free.dofadr[0])  # first of seven, of six
+        self.object_body = model.body("object").id
+        self.tip_site = np.array([model.site(name).id for name in hand.lattices])  # [F] frames of the taxels
+        # A foreign fingertip may be of several bodies. Of the own hand's last links only the tip has taxels.
+        bodies = model.body_weldid if hand.foreign else np.arange(model.nbody)
+        finger = {int(bodies[model.site_bodyid[site]]): f for f, site in enumerate(self.tip_site)}
+        # [geoms]: index of the fingertip, -1 for none; whether it is the object's.
+        self.finger_of_geom = np.array([finger.get(int(bodies[body]), -1) for body in model.geom_bodyid])
+        self.is_object = model.geom_bodyid == self.object_body
+
+
+def _addresses(joints: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([joint.qposadr[0] for joint in joints]), np.array([joint.dofadr[0] for joint in joints])
 
 
 def build_scene(hand: HandModel, parameters: TrialParameters, shape: ObjectShape, gravity: np.ndarray) -> Scene:
@@ -59,8 +66,8 @@ def build_scene(hand: HandModel, parameters: TrialParameters, shape: ObjectShape
         tips = [spec.site(name).parent.name for name in hand.lattices]
         _collide_in_pairs(spec, shape, parameters, tips)
     model = spec.compile()
-    _set_object(model, parameters)
-    scene = _index(model, hand)
+    set_object(model, parameters)
+    scene = Scene(model, hand)
     _set_springs(scene, parameters)
     return scene
 
@@ -81,18 +88,18 @@ def palm_face(scene: Scene, place: tuple[float, ...]) -> float:
 
 
 def add_object(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
-    """Add the object as the free body "object", its geoms touching nothing; `_set_object` gives it its mass."""
-    # Not "simple": its centre of mass leaves its frame when `_set_object` moves it.
+    """Add the object as the free body "object", its geoms touching nothing; `set_object` gives it its mass."""
+    # Not "simple": its centre of mass leaves its frame when `set_object` moves it.
     body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0], simple=False)
     body.add_freejoint(name="object")
     for k, part in enumerate(shape.parts):
         size = [*part.size, 0.0, 0.0][:3]
         body.add_geom(
-            name=f"object_{k}", type=_KINDS[part.kind], size=size, pos=part.place, contype=0, conaffinity=0, density=1.0
+            name=f"object_{k}", type=KINDS[part.kind], size=size, pos=part.place, contype=0, conaffinity=0, density=1.0
         )
 
 
-def _set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:
+def set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:
     """Set mass, inertia and centre of the object: a uniform solid (overlaps count twice), and the trial's errors."""
     body = model.body("object").id
     scale = parameters.mass / model.body_mass[body]
@@ -100,29 +107,6 @@ def _set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:
     model.body_inertia[body] *= scale * parameters.inertia_scale
     model.body_ipos[body] += parameters.com_offset
     mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _index(model: mujoco.MjModel, hand: HandModel) -> Scene:
-    drives = [model.joint(name) for name in hand.joints]
-    plays = [model.joint(f"{name}_play") for name in hand.joints]
-    free, body = model.joint("object"), model.body("object").id
-    sites = [model.site(name) for name in hand.lattices]
-    # A foreign fingertip may be of several bodies. Of the own hand's last links only the tip has taxels.
-    bodies = model.body_weldid if hand.foreign else np.arange(model.nbody)
-    finger = {int(bodies[site.bodyid[0]]): f for f, site in enumerate(sites)}
-    return Scene(
-        model=model,
-        drive_qpos=np.array([joint.qposadr[0] for joint in drives]),
-        drive_dof=np.array([joint.dofadr[0] for joint in drives]),
-        play_qpos=np.array([joint.qposadr[0] for joint in plays]),
-        play_dof=np.array([joint.dofadr[0] for joint in plays]),
-        object_qpos=int(free.qposadr[0]),
-        object_dof=int(free.dofadr[0]),
-        object_body=body,
-        tip_site=np.array([site.id for site in sites]),
-        finger_of_geom=np.array([finger.get(int(bodies[b]), -1) for b in model.geom_bodyid]),
-        is_object=model.geom_bodyid == body,
-    )
 
 
 def _add_drives(spec: mujoco.MjSpec, hand: HandModel, parameters: TrialParameters) -> None:
@@ -183,12 +167,7 @@ def _collide_in_pairs(spec: mujoco.MjSpec, shape: ObjectShape, parameters: Trial
     option.solver, option.iterations, option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 30, 1e-9
 
 
-# --- stiffness -----------------------------------------------------------------------------------
-
-
-def spring(
-    inverse_mass: float, stiffness: float, damping: float, step: float = TIMESTEP
-) -> tuple[np.ndarray, np.ndarray]:
+def spring(inverse_mass: float, stiffness: float, damping: float, step: float) -> tuple[np.ndarray, np.ndarray]:
     """solref and solimp of a constraint whose force at rest is `stiffness` r, for a penetration r.
 
     A constraint of impedance d and regularisation R = A (1 - d) / d gives a force (d k r + b v + a_0) / (A + R), a_0
@@ -245,9 +224,6 @@ def _set_springs(scene: Scene, parameters: TrialParameters) -> None:
             inverse_mass, joint = float(model.dof_invweight0[dof]), model.dof_jntid[dof]
             damping = 2 * np.sqrt(stiffness / inverse_mass)
             model.jnt_solref[joint], model.jnt_solimp[joint] = spring(inverse_mass, stiffness, damping, step)
-
-
-# --- contacts ------------------------------------------------------------------------------------
 
 
 class TipContact(NamedTuple):

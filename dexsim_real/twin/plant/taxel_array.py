@@ -34,7 +34,11 @@ class EmulatedTaxels:
     def __init__(self, hand: Hand, *, by_point: bool = False):
         self._place, self._area = hand.taxel_position.astype(float), hand.taxel_area.astype(float)
         self._normal, self._grid, self._by_point = hand.taxel_normal.astype(float), hand.taxel_grid, by_point
-        self._axes = _axes(self._place, self._normal, hand.taxel_grid)
+        # [F, N, 3, 3] unit vectors in the tip's frame: x across the finger, y along it to the tip, z into it.
+        along = np.gradient(self._place.reshape(len(self._place), *self._grid, 3), axis=2).reshape(self._place.shape)
+        along -= (along * self._normal).sum(-1, keepdims=True) * self._normal
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        self._axes = np.stack([np.cross(along, -self._normal), along, -self._normal], 2)
 
     def configure(self, parameters: TrialParameters, rng: np.random.Generator) -> None:
         """Set the parameters of a trial, and sample the imperfections of the taxels."""
@@ -56,9 +60,7 @@ class EmulatedTaxels:
         """Forces [F, N, 3] N on the taxels along their own axes, without imperfections.
 
         Args:
-          shape: of the object.
-          place: [3] m, position of the object.
-          turn: [3, 3] rotation of the object.
+          shape, place, turn: of the object, with its position [3] m and rotation [3, 3].
           tips: positions [F, 3] and rotations [F, 3, 3] of the fingertips' frames.
           contacts: of object and fingertips.
         """
@@ -73,7 +75,9 @@ class EmulatedTaxels:
                 normal = weight * float(np.linalg.norm(contact.normal))
                 pressed += normal
                 dragged += weight * contact.tangent
-                near += normal * _around(contact.point, taxels)
+                square = ((taxels - contact.point) ** 2).sum(-1)
+                around = np.exp(-(square - square.min()) / (2 * _SPREAD**2))
+                near += normal * (around / around.sum())
             if not self._by_point:
                 near = self._squeeze(shape, (taxels - place) @ turn) * self._area[finger]
             share = near / (near.sum() or 1.0)
@@ -93,12 +97,10 @@ class EmulatedTaxels:
         return np.where(np.abs(reading) < parameters.taxel_threshold, 0.0, reading)
 
     def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:
-        """Distance m along the skin from a contact to the nearest taxel, given the vectors [N, 3] from all taxels.
-
-        Height above a taxel counts only beyond the rubber's thickness.
-        """
+        """Distance m along the skin from a contact to the nearest taxel, given the vectors [N, 3] from all taxels."""
         height = (away * outward).sum(-1)
         along = ((away - height[:, None] * outward) ** 2).sum(-1)
+        # Height above a taxel counts only beyond the rubber's thickness.
         beyond = np.maximum(np.abs(height) - self._parameters.skin_thickness, 0.0)
         return float(np.sqrt((along + beyond**2).min()))
 
@@ -107,19 +109,3 @@ class EmulatedTaxels:
         depth = self._parameters.rubber - shape.distance(points)
         squeeze = np.clip(depth / self._parameters.skin_thickness, 0.0, 1 - _LEFT)
         return squeeze / (1.0 - squeeze)
-
-
-def _around(point: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-    """Share [N] of each taxel in the load of a contact at `point` [3] m."""
-    square = ((taxels - point) ** 2).sum(-1)
-    share = np.exp(-(square - square.min()) / (2 * _SPREAD**2))
-    return share / share.sum()
-
-
-def _axes(place: np.ndarray, normal: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """Unit vectors [F, N, 3, 3] in the tip's frame: x across the finger, y along it to the tip, z into it."""
-    lattice = place.reshape(len(place), *grid, 3)
-    along = np.gradient(lattice, axis=2).reshape(place.shape)
-    along -= (along * normal).sum(-1, keepdims=True) * normal
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    return np.stack([np.cross(along, -normal), along, -normal], 2)

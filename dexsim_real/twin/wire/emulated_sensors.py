@@ -5,7 +5,6 @@ Noise, bias, drift and delay come from the plant; this module adds formats, rate
 """
 
 import contextlib
-import errno
 import socket
 from pathlib import Path
 
@@ -14,10 +13,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig, camera_axes, encode_mask
-from dexsim_real.sensors.imu import UPRIGHT_X, encode, multiply
-from dexsim_real.twin.plant.protocol import Plant
-from dexsim_real.twin.plant.shapes import Primitive, matrix, turn
-from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.sensors.imu import UPRIGHT_X, encode
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.shapes import Primitive, matrix, product, turn
+from dexsim_real.twin.wire.line import Terminal
 
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 PICTURE = (640, 480)  # px, columns and rows
@@ -29,21 +28,21 @@ _MOUNT = np.array(UPRIGHT_X)
 class ImuFrames:
     """The RVC frames of the IMU, like a BNO08x. Its world frame has the true vertical as z and an arbitrary heading."""
 
-    def __init__(self, plant: Plant, seed: int):
+    def __init__(self, plant: EmulatedHand, seed: int):
         self.sent, self._plant = 0, plant
         up = plant.up
         level = np.array([1.0 + up[2], up[1], -up[0], 0.0])  # turns the vertical to z
-        self._world = multiply(turn((0, 0, 1), 1.0 + seed), level / np.linalg.norm(level))
+        self._world = product(turn((0, 0, 1), 1.0 + seed), level / np.linalg.norm(level))
 
     def sample(self) -> bytes:
         """The bytes of the current orientation and acceleration."""
         _, quat, specific_force = self._plant.measure_object()
         self.sent += 1
         acceleration = matrix(_MOUNT).T @ specific_force
-        return encode(self.sent, multiply(self._world, multiply(quat, _MOUNT)), tuple(acceleration))
+        return encode(self.sent, product(self._world, product(quat, _MOUNT)), tuple(acceleration))
 
 
-def picture(plant: Plant, optics: CameraConfig) -> np.ndarray:
+def picture(plant: EmulatedHand, optics: CameraConfig) -> np.ndarray:
     """The mask [rows, columns], bool, of the object as a camera sees it, with the camera's delay."""
     place, quat, _ = plant.measure_object()
     return silhouette([outline(part) @ matrix(quat).T + place for part in plant.shape.parts], optics)
@@ -67,11 +66,9 @@ def outline(part: Primitive) -> np.ndarray:
 
 
 def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:
-    """The mask [rows, columns], bool, of convex bodies.
+    """The mask [rows, columns], bool, of convex bodies, each of points [N, 3] m in the palm frame.
 
-    Args:
-      parts: points [N, 3] m of each body, palm frame. Bodies that extend behind the camera are not seen.
-      optics: the camera.
+    Bodies that extend behind the camera are not seen.
     """
     mask = np.zeros(PICTURE[::-1], bool)
     for points in parts:
@@ -88,20 +85,10 @@ def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:
     return mask
 
 
-# --- in real time --------------------------------------------------------------------------------
-
-
 class EmulatedImu:
-    """The emulated IMU on a terminal of its own: call `serve` when `due`; missed samples are skipped.
+    """The emulated IMU on a terminal of its own: call `serve` when `due`; missed samples are skipped."""
 
-    Args:
-      link: name of its terminal.
-      plant: the physics.
-      seed: of its heading.
-      start: s, time of the first sample.
-    """
-
-    def __init__(self, link: Path, plant: Plant, *, seed: int, start: float):
+    def __init__(self, link: Path, plant: EmulatedHand, *, seed: int, start: float):
         self.terminal, self.frames, self.due = Terminal(link), ImuFrames(plant, seed), start
 
     def close(self) -> None:
@@ -117,32 +104,24 @@ class EmulatedImu:
 
 
 class EmulatedCamera:
-    """The emulated camera, and the program that sends its masks to the clients of a socket.
-
-    Args:
-      path: of its socket.
-      plant: the physics.
-      seed: of the lost pictures.
-      start: s, time of the first picture.
+    """The emulated camera, and the program that sends its masks to the clients of a socket; called as `EmulatedImu`.
 
     Raises:
       HandError: the socket cannot be created.
     """
 
-    def __init__(self, path: Path, plant: Plant, *, seed: int, start: float):
+    def __init__(self, path: Path, plant: EmulatedHand, *, seed: int, start: float):
         self.path, self.due, self.sent = path, start, 0
         self._plant, self._rng = plant, np.random.default_rng(seed)
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:
-            if path.is_socket() and _abandoned(path):
-                path.unlink()
             self._server.bind(str(path))
         except OSError as error:
             self._server.close()
             raise HandError(
-                f"{path}: the socket for masks cannot be created ({error.strerror or error}); choose another "
-                "--mask-socket"
+                f"{path}: the socket for masks cannot be created ({error.strerror or error}); remove the file, or "
+                "choose another --mask-socket"
             ) from None
         self._server.listen()
         self._server.setblocking(False)
@@ -178,9 +157,3 @@ class EmulatedCamera:
             except OSError:  # The client has disconnected.
                 client.close()
                 del self._clients[client]
-
-
-def _abandoned(path: Path) -> bool:
-    """Whether a socket was left by a program that has ended: nobody listens."""
-    with socket.socket(socket.AF_UNIX) as probe:
-        return probe.connect_ex(str(path)) == errno.ECONNREFUSED

@@ -6,7 +6,7 @@ An exchange has at most one fault, so the injected faults determine what the hos
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,46 +37,38 @@ KINDS: dict[str, dict[str, tuple | range]] = {
     "stuck": {"tip": range(frames.TIPS), "taxel": range(frames.TAXELS), "count": range(256)},
 }
 """Values of each kind in the order in which a line gives them: the words or whole numbers that are possible, or from
-where to where a number is drawn that the line leaves out."""
+where to where a number is drawn that the line leaves out. Without seconds a fault lasts to the end."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """The fault of an exchange. Fields that its kind does not need keep their defaults."""
-
-    kind: str  # one of `KINDS`
-    side: str = "answer"  # of the bytes that are damaged, or "request"
-    seconds: float = np.inf  # s, delay or duration
-    part: str = ""  # that is hot: the number of a joint, "tip3", "palm"
-    kelvin: float = 0.0
-    joint: int = 0  # or `ALL`
-    board: str = ""  # of error bits
-    bits: int = 0
-    milliamperes: float = 0.0  # of a blocked joint
-    number: int = 0  # of a refusal
-    form: str = "offset"  # of a wrong angle
-    radians: float = 0.0
-    tip: int = 0
-    taxel: int = 0
-    count: int = 0
-
-    def __str__(self) -> str:
-        values = (f"{getattr(self, name):g}" if name == "seconds" else getattr(self, name) for name in KINDS[self.kind])
-        return " ".join(map(str, (self.kind, *values)))
-
-
-@dataclasses.dataclass(frozen=True)
-class FaultLine:
-    """What a line such as "12.5 stall 0.2" or "1% flip" asks for."""
+    """The fault of an exchange, of a kind in `KINDS`. Each of its values is also an attribute."""
 
     kind: str
     values: dict[str, Any]
-    time: float = np.inf  # s after the first exchange
-    probability: float = 0.0  # per exchange, of a random fault
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self.__dict__["values"][name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    def __str__(self) -> str:
+        values = (f"{value:g}" if name == "seconds" else str(value) for name, value in self.values.items())
+        return " ".join((self.kind, *values))
+
+
+class FaultLine(NamedTuple):
+    """What a line such as "12.5 stall 0.2" or "1% flip" asks for."""
+
+    kind: str
+    given: dict[str, Any]
+    time: float  # s after the first exchange; infinite for a random fault
+    probability: float  # per exchange; 0 for a fault at a time
 
     def fault(self, rng: np.random.Generator) -> Fault:
         """The fault, with values that the line leaves out sampled."""
-        return Fault(self.kind, **{name: _draw(span, rng) for name, span in KINDS[self.kind].items()} | self.values)
+        return Fault(self.kind, {name: _draw(span, rng) for name, span in KINDS[self.kind].items()} | self.given)
 
 
 def parse_fault(line: str) -> FaultLine:
@@ -87,10 +79,10 @@ def parse_fault(line: str) -> FaultLine:
     """
     try:
         when, kind, *words = line.split()
-        spans = KINDS[kind].items()
-        values = {name: _parse(span, word) for (name, span), word in zip(spans, words, strict=False)}
+        spans, share = KINDS[kind], when.endswith("%")
+        given = {name: _parse(span, word) for (name, span), word in zip(spans.items(), words, strict=False)}
         number = float(when.removesuffix("%"))
-        if len(words) > len(spans) or not 0 <= number <= (100 if when.endswith("%") else 1e6):
+        if len(words) > len(spans) or not 0 <= number <= (100 if share else 1e6):
             raise ValueError
     except (KeyError, ValueError):
         kinds = "; ".join(f"{kind} {' '.join(values).upper()}" for kind, values in KINDS.items())
@@ -98,9 +90,7 @@ def parse_fault(line: str) -> FaultLine:
             f"fault {line!r}: give a time in s or a percentage of the exchanges, a kind and its values, such as "
             f"'12.5 stall 0.2' or '1% flip'; {kinds}"
         ) from None
-    if when.endswith("%"):
-        return FaultLine(kind, values, probability=number / 100)
-    return FaultLine(kind, values, time=number)
+    return FaultLine(kind, given, np.inf, number / 100) if share else FaultLine(kind, given, number, 0.0)
 
 
 def _parse(span: tuple | range, word: str) -> Any:
@@ -108,8 +98,7 @@ def _parse(span: tuple | range, word: str) -> Any:
         return span[span.index(int(word))]
     if isinstance(span[0], str):
         return span[span.index(word)]
-    number = float(word)
-    if not abs(number) < np.inf:
+    if not np.isfinite(number := float(word)):
         raise ValueError
     return number
 
@@ -157,9 +146,9 @@ class Injector:
         self.injected[f"{fault.kind} {fault.side}" if fault.kind in BYTES else fault.kind] += 1
         return fault
 
-    def damage(self, fault: Fault, frame: bytes) -> bytes:
+    def damage(self, kind: str, frame: bytes) -> bytes:
         """The damaged bytes of a frame [bytes]; they never contain the intact frame."""
-        while frame in (bad := self._damage(fault.kind, bytearray(frame))):
+        while frame in (bad := self._damage(kind, bytearray(frame))):
             pass
         return bad
 

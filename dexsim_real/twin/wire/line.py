@@ -5,16 +5,20 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 9.60 ms, 95 % below 9.63 ms, maximum 10.7 ms).
 """
 
+import contextlib
+import os
+import termios
+import tty
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.timing import Timing
-from dexsim_real.twin.wire.faults import BYTES, Fault, Injector
+from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
-from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Parser
 from dexsim_real.wire.link import BITS_PER_BYTE
@@ -24,11 +28,76 @@ PROCESSING, JITTER = 0.00120, 0.00002  # s from a request's last byte to its ans
 EXTRA_DELAY, EXTRA_PROBABILITY = 0.0011, 0.01  # s, largest extra delay of an exchange; how often there is one
 CHUNK = 510  # bytes that the adapter forwards at once
 _SILENCE = 0.003  # s without a byte after which an incomplete request is dropped
+_RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 
 
-class _Request(NamedTuple):
-    due: float  # s, when the board has received and processed it
-    frame: Frame
+class Terminal:
+    """A pseudo-terminal that can be disconnected and reconnected. `name` is a link to the current terminal.
+
+    Args:
+      link: path of the link.
+
+    Raises:
+      HandError: the path exists and is not a link to a terminal like this one, or no terminal can be created.
+    """
+
+    def __init__(self, link: Path):
+        self.name = Path(link)
+        self._master = self._slave = -1
+        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
+        if self.name.exists() and not ours:
+            raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
+        self.open()
+
+    def open(self) -> None:
+        """Connect: create a terminal and the link to it."""
+        try:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            # Renamed into place, so that the link changes atomically.
+            fresh = self.name.with_name(f".{self.name.name}.{os.getpid()}")
+            fresh.symlink_to(os.ttyname(self._slave))
+            fresh.replace(self.name)
+        except OSError as error:
+            self.close()
+            raise HandError(
+                f"{self.name}: no pseudo-terminal can be created here ({error.strerror}); choose another path"
+            ) from None
+
+    def close(self) -> None:
+        """Disconnect: programs that have the terminal open get an error."""
+        if self.connected:
+            with contextlib.suppress(OSError):
+                if os.readlink(self.name) == os.ttyname(self._slave):
+                    self.name.unlink()
+            os.close(self._master)
+            os.close(self._slave)
+        self._master = self._slave = -1
+
+    @property
+    def connected(self) -> bool:
+        return self._master >= 0
+
+    @property
+    def baud(self) -> int | None:
+        """Baud rate set by the other side; None if unknown."""
+        return _RATES.get(termios.tcgetattr(self._slave)[5])
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        """Received bytes; empty if there are none."""
+        try:
+            return os.read(self._master, 65536)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; what nobody reads is lost, as on a wire."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
 
 
 class HandLine:
@@ -58,18 +127,17 @@ class HandLine:
         self.lateness = Timing()  # of the chunks of answers
         self._catch_up, self._note = catch_up, note
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
-        self._request: _Request | None = None  # that the board is receiving or processing
+        self._request: tuple[float, Frame] | None = None  # when the board has received and processed it (s)
         self._answer: deque[tuple[float, bytes]] = deque()  # when due (s), chunk
         self._back = np.inf  # s, end of a disconnection
         self._deaf = -np.inf  # s, end of a time in which requests are ignored
         self._heard = -np.inf
-        self._host_baud: int | None = BAUD
 
     def due(self) -> float:
         """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
         if self._answer:
             return min(self._answer[0][0], self._back)
-        return min(self._request.due if self._request else self.firmware.deadline, self._back)
+        return min(self._request[0] if self._request else self.firmware.deadline, self._back)
 
     def serve(self, now: float) -> None:
         """Do what is due."""
@@ -81,15 +149,13 @@ class HandLine:
             self._listen(now)
         if not self._request:  # A request that has arrived counts, even if this machine is late to serve it.
             self.firmware.watch(now)
-        elif self._request.due <= now:
-            request, self._request = self._request, None
-            self._act(now, request)
+        elif self._request[0] <= now:
+            (due, frame), self._request = self._request, None
+            self._act(now, due, frame)
         while self._answer and self._answer[0][0] <= now:
             due, chunk = self._answer.popleft()
             self.lateness.add(now - due)
             self.terminal.write(chunk)
-
-    # --- pieces ---------------------------------------------------------------------------------
 
     def _listen(self, now: float) -> None:
         data = self.terminal.read()
@@ -98,61 +164,50 @@ class HandLine:
                 self._parser.expire()
             return
         self._heard = now
-        if (baud := self.terminal.baud) not in (BAUD, None):
-            if baud != self._host_baud:
-                self._note(f"the host sends at {baud} baud, the hand at {BAUD}: set --link.baud")
-            self._host_baud = baud
-            return
+        if self.terminal.baud not in (BAUD, None):
+            return  # It understands nothing.
         for frame in self._parser.feed(data):
             self.counts["requests"] += 1
             if now < self._deaf or self._request or self._answer:  # It cannot listen and talk on one pair of wires.
                 self.counts["ignored"] += 1
             else:
-                due = now + _on_wire(len(frame.encode())) + self._delay()
-                self._request = _Request(due, frame)
+                extra = self._rng.uniform(0.0, EXTRA_DELAY) if self._rng.random() < EXTRA_PROBABILITY else 0.0
+                delay = max(PROCESSING + JITTER * self._rng.standard_normal(), 0.0) + extra
+                self._request = now + _on_wire(len(frame.encode())) + delay, frame
 
-    def _act(self, now: float, request: _Request) -> None:
-        """Execute a request at the time at which the palm board has received it."""
-        frame, fault = request.frame, None
-        if frame.command == Command.EXCHANGE:
-            fault = self.injector.sample(now)
-        if fault and fault.kind not in BYTES:
+    def _act(self, now: float, due: float, frame: Frame) -> None:
+        """Execute a request that the palm board has received at `due`, with at most one fault."""
+        fault = self.injector.sample(now) if frame.command == Command.EXCHANGE else None
+        kind = fault.kind if fault else ""
+        if fault and kind not in BYTES:
             self._note(f"fault {fault}")
-        if fault and fault.kind == "disconnect":
+        if fault and kind == "disconnect":
             self._back = now + fault.seconds
             self.terminal.close()
             self._parser.expire()
             return
-        if fault and fault.kind == "stall":
+        if fault and kind == "stall":
             self.counts["ignored"] += 1
             self._deaf = now + fault.seconds
             return
-        if fault and fault.kind in BYTES and fault.side == "request":  # The board does not recognise it.
+        if fault and kind in BYTES and fault.side == "request":  # The board does not recognise it.
             self.counts["damaged requests"] += 1
             return
-        if fault and fault.kind not in (*BYTES, "late"):
+        if fault and kind not in (*BYTES, "late"):
             self.firmware.begin(fault, now)
         self._catch_up(now)
-        if answer := self.firmware.answer(frame, now):
-            self._reply(now, request, answer.encode(), fault)
-
-    def _reply(self, now: float, request: _Request, data: bytes, fault: Fault | None) -> None:
+        answer = self.firmware.answer(frame, now)
+        if answer is None:
+            return
+        data = answer.encode()
         # From when it was due: a late machine catches up during the transfer.
-        start = max(request.due, now - _on_wire(len(data)) / 2)
-        damaged = False
-        if fault and fault.kind == "late":
-            start += fault.seconds
-        elif fault and fault.kind in BYTES:
-            data, damaged = self.injector.damage(fault, data), True
-        self.counts["damaged answers" if damaged else "answers"] += 1
+        start = max(due, now - _on_wire(len(data)) / 2) + (fault.seconds if fault and kind == "late" else 0.0)
+        if kind in BYTES:
+            data = self.injector.damage(kind, data)
+        self.counts["damaged answers" if kind in BYTES else "answers"] += 1
         for at in range(0, len(data), CHUNK):
             chunk = data[at : at + CHUNK]
             self._answer.append((start + _on_wire(at + len(chunk)), chunk))
-
-    def _delay(self) -> float:
-        rng = self._rng
-        extra = rng.uniform(0.0, EXTRA_DELAY) if rng.random() < EXTRA_PROBABILITY else 0.0
-        return max(PROCESSING + JITTER * rng.standard_normal(), 0.0) + extra
 
 
 def _on_wire(size: int) -> float:

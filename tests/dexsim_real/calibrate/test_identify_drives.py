@@ -6,7 +6,7 @@ import json
 import numpy as np
 import press_bench
 import pytest
-from calibrating import arguments, off, on, operator
+from calibrating import arguments, off, operator
 from press_bench import BenchHand
 
 from dexsim.calibration.maps import save_calibration
@@ -91,16 +91,9 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
     assert "exchanges are missing" in who.console.file.getvalue() and not options.output.exists()
 
 
-def test_a_hand_that_is_silent_while_it_is_tared_moves_nothing(hand, tmp_path):
-    bench = wrap(BenchHand(hand, []), lambda reply, number: None if reply.sent < 1.0 else reply)
-    with pytest.raises(HandError, match="no usable answer in 0.5 s; check the cable"):
-        moved(hand, tmp_path / "hand.log", bench)
-    assert not on(bench).any() and off(bench) and bench.closed
-
-
-def moved(hand, path, bench=None):
+def moved(hand, path):
     """The log of one joint."""
-    bench = bench or BenchHand(hand, [])
+    bench = BenchHand(hand, [])
     options = arguments(path.parent, identify=True, joints=("mid_joint1",), log=path)
     return record(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
 
@@ -124,31 +117,24 @@ def fitted_log(path, hand, calibration=None):
     return joint_log("mid_joint1", joints["mid_joint1"]["fit"], hand, source, calibration)
 
 
-@pytest.mark.parametrize("calibrated", [False, True])
-def test_a_first_exchange_without_an_answer_is_a_lost_one(hand, recorded, tmp_path, calibrated):
-    """Nothing was received before it."""
-    whole = fitted_log(recorded, hand)
-    first = next(entry.content[0] for entry in LogReader(recorded) if entry.kind == Kind.SENT)
-    cut = rewritten(
-        recorded, tmp_path / "cut.log", lambda e: None if e.kind == Kind.RECEIVED and e.content[0] == first else e
-    )
-    log = fitted_log(cut, hand, ideal_calibration(hand) if calibrated else None)
+def test_a_first_exchange_without_an_answer_is_a_lost_one(hand, recorded, tmp_path):
+    whole, seen = fitted_log(recorded, hand), []
+
+    def lose(entry):
+        if entry.kind != Kind.TICK or seen:
+            return entry
+        seen.append(entry)
+        return dataclasses.replace(entry, content=entry.content | {"answer": b"", "measured": False})
+
+    log = fitted_log(rewritten(recorded, tmp_path / "cut.log", lose), hand, ideal_calibration(hand))
     np.testing.assert_array_equal(log.target, whole.target)
     np.testing.assert_array_equal(log.position[1:], whole.position[1:])
-    assert log.position[0] == whole.position[1]
-    assert len(log.torque) == len(whole.target) if calibrated else log.torque is None
+    assert log.position[0] == whole.position[1] and whole.torque is None and len(log.torque) == len(whole.target)
 
 
-def test_exchanges_that_took_longer_than_their_period_identify_nothing(hand, tmp_path, monkeypatch):
+def test_exchanges_that_are_slow_or_missing_identify_nothing_and_a_late_one_does(hand, recorded, tmp_path, monkeypatch):
     """An adapter that waits 16 ms halves the rate, and the fit would take the motion for twice as fast."""
-    monkeypatch.setattr(press_bench, "EXCHANGE", 0.020)
-    slow = moved(hand, tmp_path / "slow.log")
-    with pytest.raises(LogError, match="exchanges took 24.1 ms, expected 12.0 ms"):
-        fitted_log(slow, hand)
-
-
-def test_a_stretch_that_is_missing_identifies_nothing_and_a_late_exchange_does(hand, recorded, tmp_path):
-    times = [entry.time for entry in LogReader(recorded) if entry.kind == Kind.SENT]
+    times = [entry.time for entry in LogReader(recorded) if entry.kind == Kind.TICK]
     begin = times[200] - 0.001
 
     def cut(name, seconds):
@@ -157,6 +143,9 @@ def test_a_stretch_that_is_missing_identifies_nothing_and_a_late_exchange_does(h
     assert len(fitted_log(cut("late.log", 0.02), hand).target) > 0.99 * len(fitted_log(recorded, hand).target)
     with pytest.raises(LogError, match=r"\d+ ms are missing"):
         fitted_log(cut("damaged.log", 1.0), hand)
+    monkeypatch.setattr(press_bench, "EXCHANGE", 0.020)
+    with pytest.raises(LogError, match="exchanges took 24.1 ms, expected 12.0 ms"):
+        fitted_log(moved(hand, tmp_path / "slow.log"), hand)
 
 
 def test_a_calibration_of_another_hand_is_refused_for_a_log(hand, recorded, tmp_path):

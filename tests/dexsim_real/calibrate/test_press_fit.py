@@ -18,9 +18,8 @@ from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.force_scale import dead_taxels, fill_dead, force_scale, upright
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_fit import fit, torque_constant_intervals, torque_constants
 from dexsim_real.calibrate.read import PressSession, Recording, Source, read_presses
-from dexsim_real.calibrate.report import torque_constant_intervals, torque_constants
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.identity import Identity
@@ -76,16 +75,14 @@ def test_the_force_over_the_root_joints_torque_comes_back(hand, session):
     assert abs(float(force) - 6.0) < friction * 1.3 + 0.3
 
 
-def test_file_and_terminal_name_hand_and_limits(hand, session):
+def test_the_calibration_names_its_hand_and_dead_taxels(hand, session):
     _, options, _, shown = session
     calibration = load_calibration(options.output, hand)
     assert (calibration.serial, calibration.handedness) == ("2R32BENCH", "right")
-    notes = "\n".join(calibration.notes)
-    assert "ring_joint1: not recorded" in notes and "error of the force sensor" in notes and "% low" in notes
     # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
+    notes = "\n".join(calibration.notes)
     assert "index: dead: column 4 row 4 read" in notes and "column 9 row 2" not in notes
-    assert "Nm / A" in shown and "index side" in shown and f"calibration: {options.output}" in shown
-    assert options.plot.stat().st_size > 20_000
+    assert "index side" in shown and options.plot.stat().st_size > 20_000
 
 
 def test_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
@@ -102,13 +99,6 @@ def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
     again = CalibrateArguments(from_log=(log,), output=tmp_path / "again.toml")
     fit_and_report(again, hand, again.from_log, operator())
     assert again.output.read_bytes() == options.output.read_bytes()
-
-
-@pytest.mark.slow
-def test_logs_add_up(hand, session, scale):
-    both = fit(read_presses([session[2], scale[1].log], hand), hand)
-    sources = [both.source[name] for name in ("index_joint1", "mid_joint1", "index_bend")]
-    assert sources == ["index pad", "middle pad", "index side"]
 
 
 def test_a_press_is_taken_from_the_last_log_that_finished_it(hand, session, tmp_path):
@@ -234,22 +224,6 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     recording.shear = list(np.outer(sums, [0.0, 20.0]))
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
         fit(session, hand)
-
-
-class Slanted(BenchHand):
-    """Every taxel reads one count along x."""
-
-    def state(self):
-        block = super().state()
-        block["tip"]["taxel"]["x"] = 1
-        return block
-
-
-@pytest.mark.slow
-def test_shear_that_is_there_at_rest_is_none(hand, tmp_path):
-    log = record(Slanted(hand, plates(hand, "index pad")), hand, arguments(tmp_path, sides=False))
-    presses = read_presses([log], hand)
-    np.testing.assert_array_equal(presses.recordings["index pad"].shear, 0.0)
 
 
 # --- the scale -------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from dexsim_real.control.safety import Safety
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.parameters import sample_trial
-from dexsim_real.twin.plant.protocol import MotorCommands
 from dexsim_real.twin.plant.scene import ROTORS, STRONG
 from dexsim_real.wire.frames import Mode
 
@@ -43,7 +42,9 @@ class Hands:
         size, before, on = self.angle.size, self.angle.copy(), np.repeat(on[:, None], 12, axis=1)
         zero, full = np.zeros(size), np.full(size, HardwareConfig().torque_max)
         kp = np.repeat(stiffness, 12) * KP
-        self._drives.send(self.time, MotorCommands(position.ravel(), kp, zero, zero, full, on.ravel() * Mode.POSITION))
+        mode = on.ravel() * Mode.POSITION
+        command = {"position": position.ravel(), "kp": kp, "ki": zero, "kd": zero, "torque_max": full, "mode": mode}
+        self._drives.send(self.time, command)
         for _ in range(round(CYCLE / PERIOD)):
             torque, _ = self._drives.step(self.time, self.angle.ravel(), self.speed.ravel())
             self.speed = (self.speed.ravel() + PERIOD * torque / self._inertia).reshape(on.shape) * on

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,6 @@ from dexsim.calibration.maps import load_calibration
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
 from dexsim_real.twin.server import PlantClock
-from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, HANDEDNESS, SERIAL
 
 
@@ -89,32 +87,18 @@ def test_it_offers_a_calibration_of_this_hand_and_ends_in_good_order_when_it_is_
     waiting.communicate()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
+    (tmp_path / "there").touch()
+    for options, says in (
         ("--faults 5,melt", "give a time in s or a percentage"),
         ("--task juggle", "choose from grasp, rotate"),
         ("--watchdog 20", "between 0 and 10"),
-        ("--link FOLDER/no/port", "no pseudo-terminal"),
-        ("--task grasp --mask-socket FOLDER/no/m", "socket for masks cannot be created"),
-    ],
-)
-def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch, options, message):
-    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
-    words = [word.replace(",", " ").replace("FOLDER", str(tmp_path)) for word in options.split()]
-    with pytest.raises(DexsimError, match=message) as error:
-        twin_command.main([*words, "--no-realtime"])
-    assert "\n" not in str(error.value)
-
-
-def test_a_socket_on_which_a_program_listens_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
-    path = tmp_path / "masks"
-    with socket.socket(socket.AF_UNIX) as other:
-        other.bind(str(path))
-        other.listen()
-        with pytest.raises(DexsimError, match="Address already in use"):
-            twin_command.main(["--task", "grasp", "--mask-socket", str(path), "--no-realtime"])
-        with socket.socket(socket.AF_UNIX) as client:
-            client.connect(str(path))
-    EmulatedCamera(path, ScriptedPlant(), seed=0, start=0.0).close()
+        (f"--link {tmp_path}/no/port", "no pseudo-terminal"),
+        (f"--task grasp --mask-socket {tmp_path}/no/m", "socket for masks cannot be created"),
+        (f"--task grasp --mask-socket {tmp_path}/there", "remove the file"),
+    ):
+        words = [word.replace(",", " ") for word in options.split()]
+        with pytest.raises(DexsimError, match=says) as error:
+            twin_command.main([*words, "--no-realtime"])
+        assert "\n" not in str(error.value)

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from emulated_plant import free
 from paths import ROOT
-from twin_plant import ScriptedPlant
 
-from dexsim import load_hand
 from dexsim.calibration.maps import current_from_counts, normalised_torque
 from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
@@ -21,21 +19,9 @@ from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.shapes import SHAPES, product
-from dexsim_real.twin.virtual import (
-    RATE,
-    VirtualCamera,
-    VirtualImu,
-    VirtualPort,
-    VirtualRun,
-    ideal_calibration,
-)
+from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera, virtual_imu
 
 CALM = {"camera_noise": 0.0, "camera_delay": 0.0, "push_rate": 0.0, "heading_error": 0.0, "place_error": 0.0}
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand()
 
 
 class Scripted:
@@ -111,7 +97,7 @@ def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
             hand, "rotate", 1, kind="nominal", overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt}
         )
         port = VirtualPort(plant)
-        imu = VirtualImu(port, 1)
+        imu = virtual_imu(port, 1)
         port.sleep(0.0901)
         imu.calibrate(IDENTITY)
         true = plant.measure_object()[1]
@@ -122,25 +108,14 @@ def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
 def test_the_camera_measures_the_height(hand):
     for shape in SHAPES:
         plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape=shape)
-        controller = Scripted(hand, "grasp", lambda k, target: target, {"camera"})
-        port = VirtualPort(plant)
-        camera = VirtualCamera(port, controller)
-        reference = np.array(controller.spec.reference)
+        port, spec = VirtualPort(plant), TaskSpec.of(make_task("grasp", hand))
+        camera, reference = virtual_camera(port, spec), np.array(spec.reference)
         free(plant, reference + (0.01, 0.0, 0.0))
         port.sleep(0.002)
         _, position, _ = camera.read()
         assert position[1:] == pytest.approx(reference[1:])
         # A composition's outline has another middle than the composition.
         assert position[0] == pytest.approx(reference[0] + 0.01, abs=0.001 if shape != "composition" else 0.006)
-
-
-def test_events_come_in_order_of_time_then_of_asking(hand):
-    port, called = VirtualPort(ScriptedPlant()), []
-    port.every(0.4, 0.3, lambda: called.append("e"))
-    for name, time in (("c", 2.0), ("a", 1.0), ("b", 1.0)):
-        port.at(time, lambda name=name: called.append((name, port.time)))
-    port.sleep(1.0)
-    assert called == ["e", "e", ("a", 1.0), ("b", 1.0)] and port.clock() == port.plant.time == 1.0
 
 
 def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
@@ -165,25 +140,18 @@ def benchmark():
 
 
 def test_metrics_of_rotations(benchmark):
+    rows = ((0, 3.0), (10, 60.0), (50, 120.0))
     reports = [
-        {
-            "successes": s,
-            "paper_successes": s + 1,
-            "seconds_to_fall": t,
-            "fell": t < 120,
-            "joint_speed": 0.5,
-        }
-        for s, t in ((0, 3.0), (10, 60.0), (50, 120.0))
+        {"successes": s, "paper_successes": s + 1, "seconds_to_fall": t, "fell": t < 120, "joint_speed": 0.5}
+        for s, t in rows
     ]
     metrics = benchmark.rotate_metrics(reports)
     assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
     assert metrics["seconds_to_fall"]["mean"] == 61.0
     assert metrics["successes_per_minute"]["mean"] == pytest.approx(60 / (183 / 60))  # stuck or not
     assert metrics["kept_to_the_end"]["mean"] == pytest.approx(1 / 3)
-    there = benchmark.simulated("rotate", "rotate")
-    text = benchmark.table(metrics, there, {"successes": {"mean": 0.25}})
-    assert "emulated hand" in text and "seconds to fall" in text and len(text.splitlines()) == 7
-    assert text.splitlines()[0].endswith("doing nothing") and text.splitlines()[1].endswith("0.25")
+    text = benchmark.table(metrics, benchmark.simulated("rotate", "rotate"), {"successes": {"mean": 0.25}})
+    assert len(text.splitlines()) == 7 and text.splitlines()[1].endswith("0.25")
 
 
 def test_metrics_of_grasps_count_only_what_was_held(benchmark):
@@ -213,9 +181,7 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
     assert [row["torque_limited"]["mean"] for row in metrics["by_command"]] == [0.0, 0.0, 0.6]
     # The lost object was pressed as wanted, 7 N, for half of the window.
     assert metrics["force_error_n"]["mean"] == pytest.approx(3.5 / np.sqrt(6))
-    text = benchmark.table(metrics, benchmark.simulated("grasp", "grasp"), {})
-    assert "command 0.5: finger force (N) " in text and "from 3 to 8 s" in text
-    assert "command 1: finger force (N) (saturates)" in text and text.count("(saturates)") == 1
+    assert benchmark.table(metrics, benchmark.simulated("grasp", "grasp"), {}).count("(saturates)") == 1
 
 
 def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):

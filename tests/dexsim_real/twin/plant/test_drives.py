@@ -35,7 +35,7 @@ def test_a_step_follows_the_second_order_closed_form(hand):
 def test_a_load_costs_a_steady_error_that_integral_action_removes(hand):
     for ki, rest in ((0.0, 0.2 / 3.0), (100.0, 0.0)):
         made, inertia = drives(hand), 2e-3
-        made.send(0.0, motors(0.5, ki=1.0 * ki))
+        made.send(0.0, motors(0.5, ki=ki))
         angle, speed = np.zeros(12), np.zeros(12)
         for k in range(60000 if ki else 2000):
             torque, _ = made.step(k * PERIOD, angle, speed)

@@ -83,7 +83,7 @@ def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
         spec.add_pair(geomname1="floor", geomname2="ball", condim=4)
         model = spec.compile()
         model.pair_solref[0], model.pair_solimp[0] = scene.spring(
-            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1)
+            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1), scene.TIMESTEP
         )
         data = mujoco.MjData(model)
         data.qvel[2] = -speed

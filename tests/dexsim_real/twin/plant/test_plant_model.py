@@ -146,6 +146,29 @@ def test_a_scene_of_its_own_is_left_out_and_its_time_step_is_kept(hand, text, wr
     assert ours.time == pytest.approx(0.2, abs=0.002) and fallen == pytest.approx(0.5 * GRAVITY * 0.04, rel=0.03)
 
 
+def test_contacts_may_be_explicit_pairs(hand, text, write):
+    """A cube rests on a palm that its file lets touch by a pair alone; what has no pair touches nothing."""
+    spec = mujoco.MjSpec.from_string(text)
+    for k, geom in enumerate(spec.geoms):
+        geom.name, geom.contype, geom.conaffinity = f"g{k}", 0, 0
+    with pytest.raises(HandError, match="no geom can touch anything"):
+        plant(hand, write(spec.to_xml()))
+    cube = spec.worldbody.add_body(name="cube", pos=[0, 0, 1])
+    cube.add_freejoint()
+    cube.add_geom(name="cube", size=[0.03, 0, 0], contype=0, conaffinity=0)
+    palm = spec.body("hand").first_geom().name
+    spec.add_pair(geomname1=palm, geomname2="cube")
+    ours = plant(hand, write(spec.to_xml()))
+    model, data, at = ours._scene.model, ours._data, ours._scene.object_qpos
+    model.opt.gravity[:] = (-GRAVITY, 0.0, 0.0)
+    free(ours, (ours._palm_face + 0.0275, -0.002, 0.075))
+    ours.drive(motors(np.full(12, 0.8)))
+    ours.advance(0.5)
+    assert data.qpos[at] == pytest.approx(0.0467, abs=5e-4) and data.ncon > 0
+    touching = {model.geom(int(geom)).name for geom in data.contact.geom.flat}
+    assert touching == {f"plant/{palm}", "object_0"}
+
+
 def test_a_contact_loads_the_nearest_taxels_with_all_of_its_force(hand):
     skin, rng = EmulatedTaxels(hand, by_point=True), np.random.default_rng(1)
     skin.configure(sample_trial("grasp", rng, "nominal", QUIET), rng)

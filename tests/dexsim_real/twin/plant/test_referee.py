@@ -7,36 +7,40 @@ import pytest
 
 from dexsim_real.twin.plant import referee
 from dexsim_real.twin.plant.assistant import REFERENCES
-from dexsim_real.twin.plant.referee import GoalCount, Referee
+from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.shapes import product, turn
 
 
-def spinning(rate, seconds, heading=0.05, fastest=2.0, step=0.01):
-    count = GoalCount(fastest)
+def look(judge, quat, spin=0.0, away=0.0, step=0.01):
+    """One look at a cube that nobody touches, `away` m from its nominal position."""
+    position, forces = np.array(REFERENCES["rotate"]) + (away, 0, 0), dict.fromkeys(("force", "normal"), np.zeros(5))
+    judge.watch(step, position, quat, np.array([spin, 0, 0]), forces, np.zeros(12), np.zeros(12, bool))
+
+
+def spinning(rate, seconds, heading=0.05, step=0.01):
+    judge = Referee("rotate")
     for k in range(round(seconds / step) + 1):
-        count.watch(turn((1, 0, 0), heading + rate * k * step), 0.0, rate)
-    return count.count
+        look(judge, turn((1, 0, 0), heading + rate * k * step), rate)
+    return judge.goals["task"], judge.goals["paper"]
 
 
 def test_goals_of_a_steady_turn():
     quarter = math.pi / 2
     for goals in (1, 5, 12):  # Goal k is reached 0.3 rad before it.
-        assert spinning(1.0, goals * quarter - referee.GOAL_ANGLE + 0.02) == goals
-        assert spinning(1.0, goals * quarter - referee.GOAL_ANGLE - 0.02) == goals - 1
-    assert spinning(-1.0, 1.0) == 0
-    # Too fast for the task, not for the paper.
-    assert spinning(3.0, 10.0) == 0 and spinning(3.0, 10.0, fastest=math.inf) == 19
+        assert spinning(1.0, goals * quarter - referee.GOAL_ANGLE + 0.02) == (goals, goals)
+        assert spinning(1.0, goals * quarter - referee.GOAL_ANGLE - 0.02) == (goals - 1, goals - 1)
+    assert spinning(-1.0, 1.0) == (0, 0)
+    assert spinning(3.0, 10.0) == (0, 19)  # Too fast for the task, not for the paper.
 
 
 def test_a_goal_needs_the_whole_orientation_and_the_place():
-    count = GoalCount(2.0)
-    count.watch(turn((1, 0, 0), 0.0), 0.0, 0.0)
-    quarter = turn((1, 0, 0), math.pi / 2)
-    count.watch(quarter, 0.06, 0.0)
-    count.watch(product(turn((0, 0, 1), 0.35), quarter), 0.0, 0.0)
-    assert count.count == 0
-    count.watch(product(turn((0, 0, 1), 0.25), quarter), 0.04, 0.0)
-    assert count.count == 1
+    judge, quarter = Referee("rotate"), turn((1, 0, 0), math.pi / 2)
+    look(judge, turn((1, 0, 0), 0.0))
+    look(judge, quarter, away=0.06)
+    look(judge, product(turn((0, 0, 1), 0.35), quarter))
+    assert judge.goals["task"] == 0
+    look(judge, product(turn((0, 0, 1), 0.25), quarter), away=0.04)
+    assert judge.goals["task"] == 1
 
 
 def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0)):

@@ -21,7 +21,7 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 def test_distances_agree_with_mujoco(part):
     spec = mujoco.MjSpec()
     size = [*part.size, 0.0, 0.0][:3]
-    spec.worldbody.add_geom(name="part", type=scene._KINDS[part.kind], size=size, pos=part.place)
+    spec.worldbody.add_geom(name="part", type=scene.KINDS[part.kind], size=size, pos=part.place)
     for k in range(200):
         spec.worldbody.add_geom(
             name=f"p{k}",
@@ -48,7 +48,7 @@ def test_mass_properties_of_a_box():
     spec, half = mujoco.MjSpec(), np.array([0.02, 0.03, 0.04])
     scene.add_object(spec, ObjectShape("box", (Primitive("box", tuple(half)),)))
     model, errors = spec.compile(), {"mass": 0.3, "inertia_scale": 1.2, "com_offset": 0.001}
-    scene._set_object(model, sample_trial("grasp", np.random.default_rng(0), overrides=errors))
+    scene.set_object(model, sample_trial("grasp", np.random.default_rng(0), overrides=errors))
     assert model.body_mass[1] == 0.3 and model.body_ipos[1] == pytest.approx(np.full(3, 0.001))
     square = half**2
     assert sorted(model.body_inertia[1]) == pytest.approx(sorted(1.2 * 0.1 * (square.sum() - square)))

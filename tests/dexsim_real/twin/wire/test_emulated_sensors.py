@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 pytest.importorskip("serial")
-from twin_line import Running
+from twin_pair import Running
 from twin_plant import ScriptedPlant
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, height_of, open_masks
-from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
+from dexsim_real.twin.plant.shapes import Primitive
 from dexsim_real.twin.wire import emulated_sensors
 
 
@@ -58,25 +58,6 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
     assert not emulated_sensors.silhouette([cube + [0, 0.6, 0]], OPTICS).any()
     flat = cube * [1, 1, 0] + [0, 0, OPTICS.position[2]]
     assert emulated_sensors.silhouette([flat], OPTICS).sum() < 100
-
-
-@pytest.mark.parametrize(
-    "part",
-    [
-        Primitive("cylinder", (0.02, 0.03)),
-        Primitive("capsule", (0.02, 0.03)),
-        Primitive("sphere", (0.03,)),
-        Primitive("box", (0.01, 0.02, 0.03), (0.01, 0.0, -0.02)),
-    ],
-)
-def test_outlines_reach_as_far_as_the_exact_shape(part):
-    shape, points = ObjectShape("one", (part,)), emulated_sensors.outline(part)
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        way = rng.standard_normal(3)
-        way /= np.linalg.norm(way)
-        exact = shape.reach(way)
-        assert exact - 0.0008 < (points @ way).max() <= exact + 1e-9
 
 
 def test_the_bridges_camera_sees_the_object(tmp_path):

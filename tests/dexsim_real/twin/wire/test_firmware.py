@@ -7,27 +7,18 @@ import numpy as np
 import pytest
 
 pytest.importorskip("serial")
-from twin_line import ask, command
+from twin_pair import command
 from twin_plant import ScriptedPlant
 
-from dexsim_real.twin.plant.protocol import PlantMeasurement
+from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.wire.faults import Fault
 from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
+from dexsim_real.wire.frames import Command, Frame, Mode
 
 
-def test_what_the_bridge_asks_is_answered_in_a_form_that_it_believes():
-    board, parser = Firmware(ScriptedPlant()), Parser(HAND_REPLIES)
-    for kind, data in (
-        (Command.EXCHANGE, command().tobytes()),
-        (Command.VERSION, b""),
-        (Command.READ_REGISTER, b"\x15\x00"),
-    ):
-        answer = ask(board, kind, data)
-        (read,) = parser.feed(answer.encode())
-        assert read == answer and (read.source, read.target, read.command) == (0x80, 0xFE, kind)
-    assert ask(board, Command.VERSION).data.startswith(b"1.3.9") and read.data.startswith(b"\x15\x00" + b"2R32")
+def ask(board, kind, data=b"", now=0.0, target=0x80):
+    return board.answer(Frame(0xFE, target, kind, data), now)
 
 
 def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
@@ -88,10 +79,10 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     board = Firmware(plant)
     for kelvin, hot in ((50.0, False), (65.0, True), (54.0, True), (49.0, False)):  # 85, 100, 89 and 84 degrees
         board.faults.clear()
-        board.begin(Fault("heat", part="4", kelvin=kelvin), now=0.0)
+        board.begin(Fault("heat", {"part": "4", "kelvin": kelvin}), now=0.0)
         state = frames.decode_state(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
-        assert plant.motors.mode.tolist() == modes == (state["raw_position"] & 0xF).tolist()
+        assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]
 
 
@@ -104,7 +95,7 @@ def test_without_an_exchange_the_motors_go_off():
     # Neither a request for the version nor a refused command keeps them on.
     ask(board, Command.VERSION, now=5.08)
     ask(board, Command.EXCHANGE, command(mode=7).tobytes(), now=5.08)
-    assert board.watch(5.0901) and not board.on and plant.motors.mode.tolist() == [0] * 12
+    assert board.watch(5.0901) and not board.on and plant.motors["mode"].tolist() == [0] * 12
     assert board.trips == [5.0901] and "no exchange for 90 ms" in notes[-1] and not board.watch(6.0)
     assert (board.state(plant.measure())["joint"]["joint_error"] == ABANDONED).all()
     state = ask(board, Command.EXCHANGE, command(mode=Mode.PASSIVE).tobytes(), now=7.0)

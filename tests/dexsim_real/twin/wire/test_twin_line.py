@@ -2,7 +2,6 @@
 
 import os
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,103 +9,64 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 pytest.importorskip("serial")
-from twin_line import Bench, Running, command
+from twin_pair import Cable, Running, command, request
 from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.twin.wire.line import Terminal
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
+from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
 from dexsim_real.wire.link import LinkConfig
 from dexsim_real.wire.serial_hand import SerialHand
 
 
-@pytest.fixture
-def bench(tmp_path):
-    made = []
-
-    def make(watchdog=0.0):
-        made.append(Bench(tmp_path, watchdog))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-
-
-def test_an_exchange_takes_what_it_takes_on_the_hand(bench):
+def test_an_exchange_takes_what_it_takes_on_the_hand():
     """On a hand: mean 9.59 to 9.60 ms, 95 % below 9.62 to 9.63 ms, at most 10.7 ms, of 1773 exchanges."""
-    one = bench()
-    times = []
+    cable, times = Cable(), []
     for _ in range(700):
-        took, data = one.exchange()
-        (frame,) = Parser(HAND_REPLIES).feed(data)
+        start = cable.now
+        pieces = cable.ask(request(), 0.012)
+        (frame,) = Parser(HAND_REPLIES).feed(b"".join(data for _, data in pieces))
         assert frame.command == Command.EXCHANGE
-        times.append(1e3 * took)
+        times.append(1e3 * (pieces[-1][0] - start))
     assert np.mean(times) == pytest.approx(9.59, abs=0.02) and np.percentile(times, 95) < 9.64
     assert 10.2 < max(times) < 10.8 and min(times) > 9.4
-    assert one.line.counts == {"requests": 700, "answers": 700}
+    assert cable.line.counts == {"requests": 700, "answers": 700}
 
 
-def test_answers_come_in_pieces_at_the_pace_of_the_wire(bench):
-    one = bench()
-    start = one.now
-    request = Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode()
-    one.send(request + request)
-    pieces = one.run(0.03)
+def test_answers_come_in_pieces_at_the_pace_of_the_wire():
+    cable = Cable()
+    start = cable.now
+    pieces = cable.ask(request() + request())
     begin = start + 297 * 10 / 3e6 + 0.0012
     ends = np.cumsum([len(data) for _, data in pieces])
     assert ends.tolist() == [510, 1020, 1530, 2040, 2217]  # A request while the board is at work is ignored.
     np.testing.assert_allclose([when for when, _ in pieces], begin + ends * 10 / 3e6, atol=2e-4)
     np.testing.assert_allclose(np.diff([when for when, _ in pieces]), np.diff(ends) * 10 / 3e6, atol=1e-9)
-    assert one.line.counts["ignored"] == 1
+    assert cable.line.counts["ignored"] == 1
 
 
-def test_the_watchdog_in_the_line(bench):
-    one = bench()
-    one.exchange()
-    one.run(5.0)
-    assert one.board.on and not one.board.trips  # There is none unless asked for.
-    one = bench(watchdog=0.08)
-    one.exchange()
-    assert one.board.on
-    asked = one.now - 0.012
-    one.run(0.5)
-    assert not one.board.on
-    assert 0.08 < one.board.trips[0] - asked < 0.083  # From when the command was understood.
-    # A request that has come counts, even when this machine looks at it too late.
-    one.exchange()
-    one.port.write(Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode())
-    one.now += 0.3
-    one.line.serve(one.now)
-    one.run(0.012)
-    assert len(one.board.trips) == 1 and one.board.on
-
-
-def test_a_host_at_another_baud_rate_is_not_understood(bench):
-    one = bench()
-    one.port.baudrate = 115200
-    assert one.exchange() is None
-    assert "115200 baud, the hand at 3000000" in one.notes[-1]
-    one.port.baudrate = 3_000_000
-    assert one.exchange() is not None
+def test_a_request_that_has_come_counts_even_when_this_machine_looks_at_it_too_late():
+    cable = Cable(watchdog=0.08)
+    cable.ask(request(), 0.012)
+    cable.to_hand += request()
+    cable.now += 0.3
+    cable.ask(b"", 0.012)
+    assert cable.board.trips == [] and cable.board.on
 
 
 @given(st.binary(max_size=600))
 def test_noise_on_the_line_is_answered_with_silence(noise):
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        one = Bench(Path(folder))
-        one.send(noise)
-        sound = len(Parser(frames.HOST_REQUESTS).feed(noise))
-        assert (one.run(0.05) != []) <= (sound > 0)
-        assert one.exchange(period=0.05) is not None
-        one.close()
+    cable = Cable()
+    answered = cable.ask(noise, 0.05) != []
+    assert answered <= (Parser(frames.HOST_REQUESTS).feed(noise) != [])
+    assert cable.ask(request(), 0.05) != []
 
 
 def test_the_driver_talks_to_it(hand, tmp_path):
     with Running(tmp_path, task="rotate", watchdog=0.08) as running:
+        with pytest.raises(HandError):  # At another baud rate it understands nothing.
+            SerialHand(running.port, LinkConfig(baud=115200, settle=0.0, handshake=0.1)).connect()
         port = SerialHand(running.port, LinkConfig(settle=0.0, margin=0.2))
         assert "firmware 1.3.9" in port.connect()
         goal, replies = REST + 0.05, []
@@ -141,13 +101,14 @@ def test_a_terminal_keeps_its_name(tmp_path):
     os.close(file)
     terminal.close()
     (tmp_path / "file").touch()
-    with pytest.raises(HandError, match="not a link"):
-        Terminal(tmp_path / "file")
-    with pytest.raises(HandError, match="no pseudo-terminal"):
-        Terminal(tmp_path / "none" / "port")
     (tmp_path / "mine").symlink_to(tmp_path / "file")
-    with pytest.raises(HandError, match="mine: already exists and is not a link to a pseudo-terminal"):
-        Terminal(tmp_path / "mine")
+    for name, says in (
+        ("file", "not a link"),
+        ("none/port", "no pseudo-terminal"),
+        ("mine", "mine: already exists and is not a link to a pseudo-terminal"),
+    ):
+        with pytest.raises(HandError, match=says):
+            Terminal(tmp_path / name)
     assert (tmp_path / "mine").resolve() == tmp_path / "file"
     (tmp_path / "stale").symlink_to("/dev/pts/999999")
     Terminal(tmp_path / "stale").close()
