@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from option_classes import OPTIONS
 from paths import ROOT
 
 from dexsim import registry
@@ -31,22 +32,6 @@ WORDS = {"README.md": 350, "CHANGELOG.md": 1000}
 """Pages with a limit of words."""
 USER_WORDS = 15_000
 """Limit of all pages for users: README and docs/*.md."""
-
-COMMANDS = {
-    "dexsim_ppo.average": "dexsim_ppo.average:AverageArguments",
-    "dexsim_ppo.evaluate": "dexsim_ppo.evaluate:EvaluateArguments",
-    "dexsim_ppo.export": "dexsim_ppo.export:ExportArguments",
-    "dexsim_ppo.record": "dexsim_ppo.record:RecordArguments",
-    "dexsim_ppo.reproduce": "dexsim_ppo.reproduce:ReproduceArguments",
-    "dexsim_real.run": "dexsim_real.run.options:RunArguments",
-    "dexsim_real.calibrate": "dexsim_real.calibrate.options:CalibrateArguments",
-    "dexsim_real.twin": "dexsim_real.twin.options:TwinArguments",
-    "dexsim_real.replay": "dexsim_real.replay.__main__:ReplayArguments",
-    "dexsim.check_hand": "dexsim.check_hand:CheckHandArguments",
-    "dexsim.view": "dexsim.view.__main__:ViewArguments",
-    "dexsim.randomization_check": "dexsim.randomization_check.__main__:CheckArguments",
-}
-"""The commands whose options are one dataclass; those of `dexsim_ppo.train` depend on the task."""
 
 
 def name_of(page: Path) -> str:
@@ -87,12 +72,11 @@ def test_command_has_its_options(line):
     module, *argv = shlex.split(line)[2:]
     module = module.rstrip(".,")
     if not argv or "--help" in argv:
-        assert module == "dexsim_ppo.train" or module in COMMANDS
+        assert module in OPTIONS
     elif module == "dexsim_ppo.train":
         parse_train(argv)
     else:
-        home, _, name = COMMANDS[module].partition(":")
-        options = cli.parse(getattr(__import__(home, fromlist=[name]), name), argv, prog=module, description="")
+        options = cli.parse(pkgutil.resolve_name(OPTIONS[module][0]), argv, prog=module, description="")
         if getattr(options, "set", None):
             policy = load_policy(options.policy)
             config = from_dict(registry.find_task(policy.task).config_class, policy.env_config)
@@ -109,10 +93,10 @@ def console_lines():
 
 @pytest.mark.parametrize("line", list(console_lines()))
 def test_console_command_exists(line):
-    from dexsim.__main__ import COMMANDS as names
+    from dexsim.__main__ import COMMANDS
 
     _, name, *argv = shlex.split(line)
-    test_command_has_its_options(shlex.join(["python", "-m", names[name][0].removesuffix(".__main__"), *argv]))
+    test_command_has_its_options(shlex.join(["python", "-m", COMMANDS[name][0].removesuffix(".__main__"), *argv]))
 
 
 def parse_train(argv: list[str]) -> None:

@@ -11,8 +11,6 @@ import pytest
 from paths import ROOT
 
 PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
-FORBIDDEN = ("optax", "flax", "orbax", "brax", "serial")
-
 in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs a checkout")
 
 
@@ -24,54 +22,6 @@ def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_import_needs_no_optional_library(package, tmp_path):
-    # A finder in front of all others sees every attempt, also at a library that is not installed.
-    attempts = run_python(
-        f"""
-import sys
-class Watch:
-    seen = []
-    def find_spec(self, name, path=None, target=None):
-        if name in {FORBIDDEN!r}:
-            self.seen.append(name)
-sys.meta_path.insert(0, Watch())
-import {package}
-loaded = [name for name in {FORBIDDEN!r} if name in sys.modules]
-print(*sorted(set(Watch.seen + loaded)))
-""",
-        tmp_path,
-        ROOT,
-    )
-    assert attempts.split() == []
-
-
-def test_real_needs_no_physics(tmp_path):
-    loaded = run_python(
-        "import sys, dexsim_real; print(*(name for name in ('mujoco', 'mujoco.mjx') if name in sys.modules))",
-        tmp_path,
-        ROOT,
-    )
-    assert loaded.split() == []
-
-
-@in_checkout
-def test_the_console_command_has_its_entry_point():
-    import pkgutil
-
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert callable(pkgutil.resolve_name(scripts["dexsim"])) and list(scripts) == ["dexsim"]
-
-
-@in_checkout
-@in_checkout
-def test_the_commands_of_the_readme_are_make_targets():
-    commands = re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert {"train", "test"} <= set(commands)
-    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert set(commands) <= set(targets)
 
 
 @in_checkout

@@ -81,15 +81,6 @@ def test_ten_thousand_random_drives():
     assert all(regime.sum() > 200 for regime in regimes)
 
 
-@pytest.mark.parametrize("push", [1, -1])
-@pytest.mark.parametrize("turn", [1, -1])
-def test_four_quadrants(push, turn):
-    """Driving and braking alike are held to tau_0 (1 - |qd| / qd_max), with the sign of what is asked for."""
-    velocity = turn * 8.63 / 4
-    torque = joint_torque(motor(), push * 10.0, 0.0, 0.0, velocity)
-    assert float(torque) == pytest.approx(push * 1.1 * 0.75, rel=1e-6)
-
-
 def test_the_edges_of_the_dead_band():
     """|error| < epsilon is dead, |error| = epsilon is not; on exact binary fractions."""
     sticky = motor(dead_band=0.125, damping=0.0)
@@ -103,25 +94,9 @@ def test_the_edges_of_the_dead_band():
     assert float(joint_torque(motor(), 0.0, 0.0, 0.0, 3.0)) == pytest.approx(-0.3)
 
 
-# --- latency -------------------------------------------------------------------------------------
-
-
 def test_a_delay_within_a_substep_is_the_mean_over_it():
     acts = [float(delayed_target(jnp.int32(k), jnp.float32(1.25), -jnp.ones(()), jnp.ones(()))) for k in range(3)]
     np.testing.assert_allclose(acts, [-1.0, 0.5, 1.0])
-
-
-def test_delay_within_a_scan_of_substeps():
-    """The sub-step at which the target starts to act, seen from inside a tick, for each environment of a batch."""
-
-    def tick(latency):
-        return jax.lax.scan(
-            lambda carry, k: (carry, delayed_target(k, latency, jnp.zeros(2), jnp.ones(2))), 0, jnp.arange(6)
-        )[1]
-
-    seen = jax.jit(jax.vmap(tick))(jnp.arange(7))
-    np.testing.assert_array_equal(seen[..., 0].sum(1), [6, 5, 4, 3, 2, 1, 0])
-    np.testing.assert_array_equal(np.argmax(seen[:6, :, 0], 1), np.arange(6))
 
 
 # --- ripple, encoder, friction ----------------------------------------------------------------------
@@ -186,14 +161,6 @@ def test_coulomb_friction_stops_in_time_and_holds():
         assert np.all(speed[201:] == 0)
         assert np.all(slide(sign * 0.0199, coulomb=0.02) == 0)
         np.testing.assert_allclose(slide(sign * 0.03, coulomb=0.02)[-1], sign * 10.0, rtol=1e-4)
-
-
-def test_viscous_friction_settles_at_torque_over_b():
-    speed = slide(0.03, coulomb=0.01, viscous=0.02, steps=2000)
-    np.testing.assert_allclose(speed[-1], (0.03 - 0.01) / 0.02, rtol=1e-5)
-    times = 1e-3 * np.arange(1, 2001)  # backward Euler of v' = (tau - c - b v) / I
-    np.testing.assert_allclose(speed, 1 - (1 + 1e-3 * 0.02 / 1e-3) ** -np.arange(1, 2001), atol=1e-4)
-    np.testing.assert_allclose(speed, 1 - np.exp(-0.02 / 1e-3 * times), atol=0.01)
 
 
 def c_hinge(coulomb, viscous, torque, timestep=5e-4):

@@ -72,12 +72,6 @@ def test_nearest_triangle_is_the_nearest_of_all():
     assert np.all((value < 0)[clear] == (across < 0)[clear]) and (value < 0).sum() > 5
 
 
-def test_the_winding_number_counts():
-    box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
-    points = np.random.default_rng(2).uniform(-0.05, 0.05, (500, 3))
-    np.testing.assert_allclose(mesh.winding_number(box, points), box_distance(points) < 0, atol=1e-9)
-
-
 def turned(part):
     part.invert()
     return part
@@ -154,13 +148,6 @@ def test_64_nodes_are_within_ten_micrometres_on_smooth_shapes(kind):
     assert error.mean() <= 10e-6 and error.max() < 40e-6
     assert np.mean((np.asarray(ours) < 0) != (value < 0)) < 0.004
     assert np.degrees(np.arccos(np.clip(np.sum(ours_normal * normal, -1), -1, 1))).mean() < 1.0
-
-
-def test_edges_cost_no_more_than_a_cell():
-    shape = solid("box", *BOX)
-    points, value, _ = shell(shape)
-    error = np.abs(np.asarray(signed_distance(points, grid.bake(shape))) - value)
-    assert error.mean() <= 10e-6 and np.quantile(error, 0.95) < 50e-6 and error.max() < 0.5e-3
 
 
 def trilinear(points, distance, origin, step):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dexsim.geometry import distance, grid, mesh, sdf, surface_points
+from dexsim.geometry import mesh, sdf, surface_points
 
 SIZES = {
     "sphere": (0.03, 0, 0),
@@ -91,24 +91,3 @@ def test_points_of_a_mesh():
     truth = np.linalg.norm(points, axis=1) - 0.03
     near = np.abs(truth) < 0.003
     assert np.abs(value - truth)[near].mean() < 2e-4
-
-
-# --- by name -------------------------------------------------------------------------------------
-
-
-def test_one_signature_for_all():
-    shape = solid("sphere", 0.03)
-    points = probes(shape, 500)
-    truth = np.linalg.norm(points, axis=1) - 0.03
-    near = np.abs(truth) < 0.003
-    for name, bound, geometry in (
-        ("closed_form", 1e-7, shape),
-        ("grid", 1.5e-5, grid.bake(shape)),
-        ("surface_points", 2e-4, surface_points.from_shape(shape)),
-    ):
-        assert name in distance.METHODS
-        value, normal = jax.jit(distance.distance_and_normal)(points, geometry)
-        np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, geometry), value)
-        assert np.abs(value - truth)[near].max() < bound
-        outward = points / np.linalg.norm(points, axis=1, keepdims=True)
-        assert np.sum(normal * outward, -1)[near].min() > 0.99

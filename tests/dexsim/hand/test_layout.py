@@ -63,16 +63,6 @@ def test_patches_lie_on_their_surface(kind, sizes, shape):
     np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
 
 
-def test_areas_add_up_to_the_surface():
-    """A fine lattice round a whole zone of a sphere: 2 pi R times its height (Archimedes)."""
-    radius, columns = 0.01, 120
-    pitch = 2 * np.pi * radius / columns
-    points = layout.lattice(columns, 40, pitch=pitch * (1 - 1e-9))
-    patch = layout.on_surface("sphere", points, radius=radius)
-    height = 2 * radius * np.sin(20 * pitch / radius)
-    assert patch.area.sum() == pytest.approx(2 * np.pi * radius * height, rel=1e-3)
-
-
 def test_a_patch_of_a_mesh():
     """On a fine ball the rays meet the sphere, and the areas are those of the surface below the cells."""
     trimesh = pytest.importorskip("trimesh")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -77,17 +78,10 @@ def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_
     assert shelf.names() == ("grasp", str(file), NONE), "the policy of another observation is not offered"
     assert shelf.get(str(file)).training == grasp.training
     dataclasses.replace(grasp, training={"steps": 1}).save(file)
-    set_back(file, 5)
+    os.utime(file, (time.time() - 5,) * 2)  # also where the clock of the file system is coarse
     assert shelf.get(str(file)).training == {"steps": 1}
     file.write_bytes(b"half a file")
     assert shelf.get(str(file)).training == {"steps": 1}, "a damaged file keeps the last sound policy"
-
-
-def set_back(file, seconds):
-    """Another time of change, also where the clock of the file system is coarse."""
-    import os
-
-    os.utime(file, (time.time() - seconds,) * 2)
 
 
 # --- sources --------------------------------------------------------------------------------------------
@@ -166,6 +160,8 @@ def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypa
     assert made == [("grasp", "inspire_like"), NONE]
     with pytest.raises(AssetError, match="no shipped hand has that name"):
         open_source(ViewArguments(what="grasp", hand="no_such_hand"))
+    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
+        open_source(ViewArguments(what="no_such_thing"))
 
 
 @pytest.mark.slow
@@ -201,11 +197,6 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
     assert frames[0].kinds == () and source.controls()["go to [s]"].high == pytest.approx(0.6, abs=0.2)
     late = source.reset({"go to [s]": 0.3}).snapshot
     assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
-
-
-def test_what_is_nothing_is_refused_in_one_line():
-    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
-        open_source(ViewArguments(what="no_such_thing"))
 
 
 def test_view_names_the_missing_extra_before_it_imports_jax():
