@@ -87,10 +87,3 @@ def test_what_no_sample_shows_is_added_in_quadrature():
     plain, known = (fit_joint(JointPress(force, value, gain_error=share), "A") for share in (0.0, 0.3))
     assert np.ptp(known.loading.gain_interval) > 0.03 > np.ptp(plain.loading.gain_interval)
     assert known.loading.offset_interval == plain.loading.offset_interval and known.notes == plain.notes
-
-
-def test_few_presses_are_said():
-    for presses, said in ((2, True), (3, False)):
-        force, value = varied_presses(np.random.default_rng(5), presses=presses)
-        notes = fit_joint(JointPress(force, value), "A").notes
-        assert any("fewer than 3 presses" in note for note in notes) == said
