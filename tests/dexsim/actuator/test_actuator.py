@@ -152,17 +152,6 @@ def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velo
     return np.asarray(jax.lax.scan(body, jnp.float32(velocity), wanted)[1])
 
 
-def test_coulomb_friction_stops_in_time_and_holds():
-    """v(t) = v0 - c t / I, exactly 0 from v0 I / c on; held up to c, let go beyond."""
-    for sign in (1, -1):
-        speed = slide(0.0, coulomb=0.02, velocity=sign * 4.0)
-        times = 1e-3 * np.arange(1, 1001)
-        np.testing.assert_allclose(speed, sign * np.maximum(4.0 - 20.0 * times, 0), atol=2e-4)
-        assert np.all(speed[201:] == 0)
-        assert np.all(slide(sign * 0.0199, coulomb=0.02) == 0)
-        np.testing.assert_allclose(slide(sign * 0.03, coulomb=0.02)[-1], sign * 10.0, rtol=1e-4)
-
-
 def c_hinge(coulomb, viscous, torque, timestep=5e-4):
     """Angles and speeds of a hinge with frictionloss and damping in C MuJoCo."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -193,28 +182,6 @@ def test_friction_is_c_mujocos(coulomb, viscous):
 
 
 # --- every parameter is a leaf -------------------------------------------------------------------
-
-
-def gradient(drive, *state):
-    return jax.jit(jax.grad(actuator.joint_torque))(drive, *(jnp.float32(x) for x in state))
-
-
-def test_gradients_where_the_motor_is_free():
-    """tau = eta (kp e - kd qd): e = 0.1, qd = 1."""
-    slope = gradient(motor(efficiency=0.9), 0.1, 0.0, 0.0, 1.0)
-    assert float(slope.stiffness) == pytest.approx(0.9 * 0.1, rel=1e-5)
-    assert float(slope.damping) == pytest.approx(-0.9, rel=1e-5)
-    assert float(slope.efficiency) == pytest.approx(3 * 0.1 - 0.1, rel=1e-5)
-    assert float(slope.stall_torque) == float(slope.no_load_speed) == float(slope.dead_band) == 0
-
-
-def test_gradients_where_the_envelope_holds():
-    """tau = eta tau_0 (1 - qd / qd_max): qd = 2."""
-    slope = gradient(motor(efficiency=0.9), 2.0, 0.0, 0.0, 2.0)
-    assert float(slope.stall_torque) == pytest.approx(0.9 * (1 - 2 / 8.63), rel=1e-5)
-    assert float(slope.no_load_speed) == pytest.approx(0.9 * 1.1 * 2 / 8.63**2, rel=1e-5)
-    assert float(slope.efficiency) == pytest.approx(1.1 * (1 - 2 / 8.63), rel=1e-5)
-    assert float(slope.stiffness) == float(slope.damping) == 0
 
 
 def test_a_drive_is_at_its_limit_where_it_gives_less_than_its_loop_asks_for():

@@ -28,7 +28,7 @@ from dexsim.calibration.maps import (
 from dexsim.calibration.plot import plot_calibration
 from dexsim.calibration.press import MIN_LEVER, lever_arms
 from dexsim.core.errors import CalibrationError
-from dexsim.core.robust_line import fit_line, long_run, theil_sen
+from dexsim.core.robust_line import fit_line, theil_sen
 
 # --- lines -----------------------------------------------------------------------------------
 
@@ -67,13 +67,6 @@ def test_intervals_hold_the_truth(rho, least):
             line.offset_interval[0] <= 0.3 <= line.offset_interval[1],
         ]
     assert np.all(hits / 300 >= least) and np.all(hits / 300 <= 0.985)
-
-
-def test_the_long_run_variance_of_an_ar1_series():
-    """Known: (1 + rho) / (1 - rho) times that of white noise."""
-    rng = np.random.default_rng(3)
-    variance = np.mean([long_run(ar1(rng, 4000, 0.5)[:, None])[0, 0] / 4000 for _ in range(20)])
-    assert variance == pytest.approx(3.0, rel=0.12)
 
 
 @pytest.mark.parametrize("kind", ["random", "one-sided", "dropped"])
@@ -143,23 +136,6 @@ def calibrated(hand, motor=MOTOR, names=None, **options):
 @pytest.fixture(scope="module")
 def fitted(hand):
     return calibrated(hand)
-
-
-def test_run_time_torque_is_the_motors(hand, fitted):
-    """The current that a known motor draws while pressing comes back as the torque on the joint."""
-    calibration = fitted[0]
-    torque = np.linspace(0.02, 0.45, 12)
-    loading = torque / (0.9 * 0.8) + 0.024
-    unloading = torque * 0.7 / 0.9 - 0.016
-    np.testing.assert_allclose(joint_torque(calibration, loading, 1.0), torque, rtol=0.03, atol=0.004)
-    np.testing.assert_allclose(joint_torque(calibration, unloading, -1.0), torque, rtol=0.03, atol=0.004)
-    unknown = np.asarray(joint_torque(calibration, loading))
-    band = np.asarray(calibration.real.friction) * np.abs(
-        np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
-    )
-    assert np.all(np.abs(unknown - torque) < 2 * band + 0.005)
-    normalised = normalised_torque(calibration, loading, 1.0)
-    np.testing.assert_allclose(normalised, joint_torque(calibration, loading, 1.0) / hand.torque_limit, rtol=1e-5)
 
 
 def test_a_hand_that_counts_backwards(hand, fitted):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shapes import solid
 
 from dexsim.core.errors import AssetError
 from dexsim.geometry import grid, mesh, sdf
@@ -19,12 +20,6 @@ exact = jax.jit(sdf.distance_and_normal)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path / "cache"))
-
-
-def solid(kind, *size):
-    return sdf.Shape(
-        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
-    )
 
 
 def box_distance(points, half=BOX):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from shapes import solid
 
 from dexsim.geometry import mesh, sdf, surface_points
 
@@ -17,12 +18,6 @@ SIZES = {
 }
 FEW = 300
 nearest = jax.jit(surface_points.nearest)
-
-
-def solid(kind, *size):
-    return sdf.Shape(
-        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
-    )
 
 
 def union():
@@ -56,14 +51,6 @@ def test_the_search_finds_the_nearest():
     np.testing.assert_allclose(ours, gap[:, 0], atol=1e-6)
     sure = near & (gap[:, 1] - gap[:, 0] > 1e-6)
     np.testing.assert_array_equal(found[sure], wanted[sure, 0])
-
-
-def test_depth_is_the_offset_along_the_normal():
-    """By hand: one point at the origin that looks up."""
-    surface = surface_points.SurfacePoints(jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]))
-    value, normal = surface_points.distance_and_normal(jnp.array([[0.01, 0, -0.002], [0.0, 0.03, 0.004]]), surface)
-    np.testing.assert_allclose(value, [-0.002, 0.004], atol=1e-9)
-    np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
 
 
 def test_sizes_may_be_traced_and_differ_between_environments():

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from shapes import solid
 
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError, ConfigError
@@ -13,12 +14,6 @@ from dexsim.geometry import sdf
 from dexsim.geometry.mesh import load_mesh
 from dexsim.hand import layout
 from dexsim.hand.load import load_hand
-
-
-def solid(kind, *size):
-    return sdf.Shape(
-        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
-    )
 
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])

@@ -12,7 +12,7 @@ import scipy.stats
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import Excitation, chirp, excitation, joint_excitation, steps, triangles
 from dexsim.identification.identify import FIT, check_log, evaluate, identify, uncertainty
-from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
+from dexsim.identification.joint import PARAMETERS, JointLog, simulate, with_defaults
 
 PERIOD, SUBSTEPS = 0.015, 3
 TRUTH = dict(
@@ -81,16 +81,6 @@ def test_the_hand_stays_within_its_limits(hand):
 
 
 # --- recovery ------------------------------------------------------------------------------------------
-
-
-def test_segments_begin_where_the_joint_rests():
-    segment, angle = segments(log_of(TRUTH))
-    assert segment[0] == 0 and segment[-1] + 1 == len(angle) and np.all(np.diff(segment) >= 0)
-    assert 10 <= len(angle) <= 22  # rests, pauses and steps
-    firsts = np.flatnonzero(np.diff(segment)) + 1
-    quiet = log_of(TRUTH, noise=0.0)
-    assert np.all(np.abs(np.gradient(quiet.position))[firsts] / PERIOD < 0.02)
-    np.testing.assert_allclose(angle[1:], quiet.position[firsts], atol=1.5e-3)
 
 
 def recovered(seed):

@@ -129,18 +129,6 @@ def test_sizes_fill_their_ranges():
     within(union.size[~boxy, CYLINDER, 1], config.cylinder_half, config.composition_scale)
 
 
-def test_physical_parameters_fill_their_ranges():
-    config = ObjectConfig()
-    drawn = default()
-    within(drawn.mass, config.mass)
-    within(drawn.friction, config.friction)
-    ratio = [float(damping_ratio(jnp.float32(e))) for e in config.restitution[::-1]]
-    within(drawn.contact[:, 1], ratio)
-    within(drawn.contact[:, 0], config.stiffness)
-    parameters = [drawn.mass, drawn.friction, *drawn.contact.T]
-    assert np.abs(np.corrcoef(parameters) - np.eye(4)).max() < 0.2
-
-
 @pytest.mark.parametrize(
     ("shapes", "slots"),
     [

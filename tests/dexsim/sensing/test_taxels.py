@@ -15,14 +15,6 @@ SHAPE = (FINGERS, GRID[0] * GRID[1])
 KEY = jax.random.key(0)
 IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
 UNIT = np.ones((1, 1), np.float32)
-ALL = {
-    "hysteresis": (0.0, 0.3),
-    "crosstalk": (0.0, 0.1),
-    "gain": (0.85, 1.15),
-    "bias": (-0.03, 0.03),
-    "drift": (0.0, 0.005),
-    "dead": (0.0, 0.05),
-}
 BASE = 5.0  # N on every taxel, so that errors of both signs are read
 
 
@@ -151,17 +143,3 @@ def test_sampling_below_the_control_rate_holds_the_last_reading():
     np.testing.assert_array_equal(readings, np.broadcast_to(readings[:, :1, :1], readings.shape))
     phases = jax.vmap(lambda key: sensor.sample(key).phase)(jax.random.split(KEY, 200))
     assert 0.2 < float(phases.std()) < 0.35
-
-
-def test_all_at_once_under_vmap():
-    sensor = TaxelArray(TaxelSensor(rate=(20.0, 40.0), **ALL), GRID, FINGERS, PERIOD)
-    keys = jax.random.split(KEY, 3)
-    params = jax.vmap(sensor.sample)(keys)
-    state = jax.tree.map(lambda x: jnp.stack([x] * 3), sensor.init())
-    force = jnp.stack([jnp.asarray(forces(seed)) for seed in range(3)])
-    after, reading = jax.jit(jax.vmap(sensor.apply))(params, state, keys, force)
-    one, alone = sensor.apply(jax.tree.map(lambda x: x[1], params), sensor.init(), keys[1], force[1])
-    np.testing.assert_allclose(reading[1], alone, atol=1e-5)
-    assert jax.tree.structure(after) == jax.tree.structure(state)
-    counts = np.asarray(reading) / 0.1
-    np.testing.assert_allclose(counts, np.round(counts), atol=1e-4)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from palm_touch import feel
+from shapes import solid
 
-from dexsim.geometry import sdf
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.touch import reduce as touch_reduce
 from dexsim.touch import skin as touch_skin
@@ -16,11 +16,6 @@ from dexsim.touch.skin import Skin
 EYE = np.eye(3, dtype=np.float32)
 reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
 skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
-
-
-def solid(kind, *size):
-    size = (*size, 0, 0)[:3]
-    return sdf.Shape((kind,), jnp.asarray([size], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True]))
 
 
 def flat_lattice(columns, rows, pitch, shift=(0.0, 0.0)):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shapes import solid
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, rotations, sdf, surface_points
@@ -18,8 +19,7 @@ from dexsim.touch.reduce import reduce_touch, reduce_touch_links
 from dexsim.touch.skin import MATERIALS, Skin, skin_of, skin_stress
 
 JOINTS = np.float32([1.45, 0.08, 0.12, 0.0, 0.55, 0.4, 0.55, 0.4, 0.55, 0.4, 0.55, 0.4])
-BALL = sdf.Shape(("sphere",), jnp.array([[0.03, 0, 0]]), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True]))
-BRICK = sdf.Shape(("box",), jnp.array([[0.02, 0.03, 0.025]]), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True]))
+BALL, BRICK = solid("sphere", 0.03), solid("box", 0.02, 0.03, 0.025)
 # Index, middle and ring finger are pressed up to 2.3 mm into a ball of 30 mm there.
 PLACE, TOTAL = np.float32([0.0324, 0.0062, 0.1457]), np.float32([4.0, 1.0, 2.5, 0.5, 3.0])
 TURN = np.asarray(rotations.axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64]), jnp.float32(0.7)))

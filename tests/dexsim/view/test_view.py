@@ -21,7 +21,7 @@ from dexsim.render.picture import Pose
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.policies import NONE, PolicyShelf
-from dexsim.view.scene import force_arrows, primitive
+from dexsim.view.scene import force_arrows
 from dexsim.view.simulation import Simulation
 from dexsim_ppo import load_policy
 
@@ -47,20 +47,6 @@ def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
     force[2, 17] = 4.0
     ((longer, _),) = force_arrows(pose, force)
     np.testing.assert_allclose(np.linalg.norm(head - longer), 2 * np.linalg.norm(head - tail), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("kind", "size", "half"),
-    [
-        ("box", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
-        ("capsule", (0.01, 0.02, 0), (0.01, 0.01, 0.03)),
-        ("cylinder", (0.01, 0.02, 0), (0.01, 0.01, 0.02)),
-        ("sphere", (0.01, 0, 0), (0.01, 0.01, 0.01)),
-        ("ellipsoid", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
-    ],
-)
-def test_primitives_have_their_size(kind, size, half):
-    np.testing.assert_allclose(primitive(kind, np.array(size)).bounds, [-np.array(half), half], rtol=0.02)
 
 
 # --- policies -------------------------------------------------------------------------------------------
