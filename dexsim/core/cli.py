@@ -134,11 +134,8 @@ def check_writable(path: Path) -> None:
 
 
 def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
-    """Check that no file which a command writes is one that it reads, or another one that it writes.
-
-    Args:
-      outputs: option to its file.
-      inputs: what it is to its file, or to a name that may be none.
+    """Check that no file which a command writes (by option) is one that it reads (by what that is), or another one that
+    it writes.
 
     Raises:
       ConfigError: there is such a file.

@@ -5,8 +5,8 @@
     check_outside(patch, geometry)                                       # no taxel inside the link
     write_layout("taxels.csv", {"index": patch, "thumb": other})
 
-The file is the one that a hand's TOML names as `taxels` (`hand.load_hand`); `finger` in it stands for the link that
-carries the taxels. Taxel index = column * rows + row. Shapes: N taxels. Units: m, m^2.
+The file is the one that a hand's TOML names as `taxels`; `finger` in it is the link that carries the taxels.
+Taxel index = column * rows + row. Shapes: N taxels. Units: m, m^2.
 """
 
 from __future__ import annotations
@@ -55,7 +55,6 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
     """A lattice centred on zero.
 
     Args:
-      columns, rows: how many.
       pitch: distance of neighbours; for "rect" also (across, along).
       kind: "rect", or "hex" with every other row shifted by half a pitch and rows sqrt(3)/2 pitches apart.
 
@@ -140,13 +139,10 @@ def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> 
 
 
 def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
-    """Require that no taxel is deeper than `tolerance` inside the link it sits on.
-
-    Args:
-      geometry: the link's surface in its frame, such as `grid.bake` gives.
+    """Require that no taxel is deeper than `tolerance` m inside its link, whose surface `grid.bake` gives for example.
 
     Raises:
-      AssetError: one does; names it and its depth.
+      AssetError: names the deepest one.
     """
     from dexsim.geometry.distance import signed_distance
 
@@ -256,10 +252,8 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does.
-
-    Moeller and Trumbore 1997.
-    """
+    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does
+    (Moeller and Trumbore 1997)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     ab, ac = b - a, c - a
     across = np.cross(ray, ac)

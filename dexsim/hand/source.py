@@ -1,7 +1,7 @@
-"""Which files a hand was read from, so that what was trained on it is used on the same hand.
+"""Provenance of a hand, so that what was trained on it is used on the same hand.
 
 A record is plain data: the TOML's name as it was given, a hash of the hand's files, and what its arrays count. None
-stands for the shipped default hand, of which policies have no record.
+stands for the shipped default hand.
 """
 
 import warnings

@@ -60,8 +60,7 @@ def open_source(arguments: ViewArguments) -> "Source":
         return Emulation(name, arguments.seed, arguments.hand)
     from dexsim.hand.load import load_hand
     from dexsim.registry import find_task, make
-    from dexsim.view.policies import NONE, PolicyShelf
-    from dexsim.view.simulation import Simulation
+    from dexsim.view.simulation import NONE, PolicyShelf, Simulation
     from dexsim_ppo.policy import load_policy
 
     try:

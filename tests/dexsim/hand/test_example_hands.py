@@ -8,8 +8,8 @@ from dexsim import check_hand
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics
 from dexsim.hand.load import load_hand
 
-# Tips (m, palm frame) by finger with all motors at 0 and at 0.4 rad, multiplied out from the published chains: LEAP Hand
-# of MuJoCo Menagerie (right_hand.xml; tips are the ends of its fingertip meshes), Inspire RH56 of dexsuite/dex-urdf.
+# Tips (m, palm frame) by finger with all motors at 0 and at 0.4 rad, multiplied out from the published chains: LEAP
+# Hand of MuJoCo Menagerie (right_hand.xml; ends of its fingertip meshes), Inspire RH56 of dexsuite/dex-urdf.
 TIPS = {
     "leap_like": {
         "thumb": [(0.0215, 0.1387, -0.0823), (0.0897, 0.0975, -0.0246)],

@@ -20,9 +20,8 @@ from dexsim.objects.config import KINDS
 from dexsim.render.picture import Pose
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.view.__main__ import ViewArguments, open_source
-from dexsim.view.policies import NONE, PolicyShelf
 from dexsim.view.scene import force_arrows
-from dexsim.view.simulation import Simulation
+from dexsim.view.simulation import NONE, PolicyShelf, Simulation
 from dexsim_ppo import load_policy
 
 VALUES = {"policy": "grasp", "object": "any", "command": 0.5, "friction factor": 1.0, "push [m/s]": 0.0, "push": False}
@@ -140,7 +139,7 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
 def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
     made = []
     monkeypatch.setattr("dexsim.registry.make", lambda task, hand: made.append((task, hand.name)))
-    monkeypatch.setattr("dexsim.view.policies.PolicyShelf", lambda env, first: made.append(first))
+    monkeypatch.setattr("dexsim.view.simulation.PolicyShelf", lambda env, first: made.append(first))
     monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
     open_source(ViewArguments(what="grasp", hand="inspire_like"))
     assert made == [("grasp", "inspire_like"), NONE]
