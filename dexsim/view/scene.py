@@ -26,13 +26,7 @@ _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
 
 
 class Scene:
-    """A hand in the browser.
-
-    Args:
-      server: of viser.
-      hand: the hand.
-      camera: a preset of `CAMERAS`, which also says where up is.
-    """
+    """A hand in the browser: on a server of viser, seen by a preset of `CAMERAS`, which also says where up is."""
 
     def __init__(self, server: Any, hand: Hand, camera: str):
         self._server, self._hand = server, hand

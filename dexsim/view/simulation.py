@@ -32,13 +32,8 @@ _NEWEST = 20  # files of runs that are listed
 
 
 class PolicyShelf:
-    """Policies that fit an environment, by the name of a shipped one or the path of a file, read again when it changes.
-
-    Args:
-      env: the environment whose observation they must take.
-      first: the policy that the view begins with; `NONE` for none.
-      runs: folder of the training runs.
-    """
+    """Policies that take an environment's observation, by the name of a shipped one or the path of a file, which is
+    read again when it changes. The view begins with `first`."""
 
     def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
         self._layout, self._runs, self._first = tuple(env.observation_layout["actor"]), runs, first
@@ -72,13 +67,7 @@ def _changed(path: Path) -> float:
 
 
 class Simulation:
-    """Episodes of an environment; the page chooses policy, object, command, friction and pushes.
-
-    Args:
-      env: made for one environment.
-      policies: to choose from.
-      seed: of the episodes.
-    """
+    """Episodes of an environment; the page chooses policy, object, command, friction and pushes."""
 
     def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies

@@ -22,12 +22,7 @@ _CHOICES = 3.0  # s between two looks for new choices
 
 
 class Viewer:
-    """A source in the browser.
-
-    Args:
-      source: what is shown.
-      title: of the page.
-      host, port: where the page is served.
+    """A source in the browser, on a page that is served at a host and port.
 
     Raises:
       DexsimError: viser is not installed, or `host` is no address of this computer.
