@@ -17,11 +17,9 @@ from dexsim.calibration.fit import calibrate
 from dexsim.calibration.joint import JointPress, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
-    current_from_counts,
     joint_torque,
     load_calibration,
     normalise,
-    normalised_torque,
     save_calibration,
     taxel_force,
 )
@@ -148,17 +146,6 @@ def test_a_hand_that_counts_backwards(hand, fitted):
     force, value = normalise(other.real, 0, turned["thumb_bend"].force, turned["thumb_bend"].value)
     for axis in (force, value):  # the paper's [0, 1]
         assert axis.max() == pytest.approx(1.0, abs=0.02) and axis.min() > -0.1
-
-
-def test_maps_under_jit_and_vmap(fitted):
-    calibration = fitted[0]
-    current = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, (7, 12)), jnp.float32)
-    passed = jax.jit(jax.vmap(normalised_torque, (None, 0)))(calibration, current)
-    np.testing.assert_allclose(passed, normalised_torque(calibration, current), rtol=1e-5, atol=1e-6)
-    slope = jax.grad(lambda c: joint_torque(calibration, c)[3])(current[0])
-    gain = np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
-    np.testing.assert_allclose(slope, np.where(np.arange(12) == 3, gain, 0), rtol=1e-5)
-    np.testing.assert_allclose(current_from_counts(calibration, jnp.array([250.0])), 0.25)
 
 
 def test_taxel_counts_become_newtons(fitted):

@@ -1,11 +1,10 @@
 """The hand: published kinematics, masses and taxels; C MuJoCo; a second, different hand; broken files."""
 
 import jax
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
+from dexsim.check_hand import check_kinematics
 from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics
 from dexsim.hand.load import load_hand
@@ -101,66 +100,6 @@ def test_flexion_joints_run_from_root_to_tip(hand):
     assert flexion_joints(hand, range(1, 1)).dtype == int  # of a hand of one finger: none, to index with
     assert flexion_joints(hand, range(1, 5)).tolist() == [4, 5, 6, 7, 8, 9, 10, 11]
     assert flexion_joints(hand, range(0, 1)).tolist() == [1, 2]
-
-
-def relative_to_palm(model, data, palm, position, matrix):
-    """World poses [n, 3], [n, 9] from C MuJoCo, in the palm's frame."""
-    body = model.body(palm).id
-    turn = data.xmat[body].reshape(3, 3)
-    return (position - data.xpos[body]) @ turn, turn.T @ matrix.reshape(-1, 3, 3)
-
-
-def check_against_mujoco(hand, kinematics, count=50):
-    """Every body and tip site at random joint angles within the limits, to 1e-6."""
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    data = mujoco.MjData(model)
-    bodies = [model.body(name).id for name in hand.body_names]
-    rng = np.random.default_rng(1)
-    for _ in range(count):
-        joints = rng.uniform(hand.joint_lower, hand.joint_upper).astype(np.float32)
-        for name, angle in zip(hand.joint_names, joints, strict=True):
-            data.qpos[model.joint(name).qposadr[0]] = angle
-        mujoco.mj_forward(model, data)
-        ours = kinematics(joints)
-        position, matrix = relative_to_palm(model, data, hand.palm, data.xpos[bodies], data.xmat[bodies])
-        np.testing.assert_allclose(ours.body_position, position, atol=1e-6)
-        np.testing.assert_allclose(ours.body_rotation, matrix, atol=2e-6)
-        tips = [model.site(name).id for name in TIP_SITES[hand.name]]
-        position, _ = relative_to_palm(model, data, hand.palm, data.site_xpos[tips], data.site_xmat[tips])
-        np.testing.assert_allclose(ours.tip_position, position, atol=1e-6)
-        owners = matrix[[bodies.index(int(model.site_bodyid[tip])) for tip in tips]]
-        np.testing.assert_allclose(ours.tip_rotation, owners, atol=2e-6)
-
-
-TIP_SITES = {
-    "xhand_right": ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip"),
-    "pinch": ("left_tip", "right_tip"),
-}
-
-
-def test_kinematics_equal_mujoco(hand, kinematics):
-    check_against_mujoco(hand, kinematics)
-
-
-def test_kinematics_are_differentiable(hand, kinematics):
-    """The Jacobian of the index tip against central differences."""
-    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
-    exact = np.asarray(jax.jacfwd(lambda q: kinematics(q).tip_position[1])(joints))
-    step = 1e-2
-    numeric = np.stack(
-        [
-            (
-                np.asarray(kinematics(joints.at[j].add(step)).tip_position[1])
-                - np.asarray(kinematics(joints.at[j].add(-step)).tip_position[1])
-            )
-            / (2 * step)
-            for j in range(12)
-        ],
-        1,
-    )
-    np.testing.assert_allclose(exact, numeric, atol=2e-5)
-    assert np.all(exact[:, [0, 1, 2, 6, 7, 8, 9, 10, 11]] == 0)  # other fingers' joints
-    assert np.all(np.linalg.norm(exact[:, 3:6], axis=0) > 0.01)
 
 
 # --- taxels ------------------------------------------------------------------------------------
@@ -260,6 +199,7 @@ def write_pinch(folder, layout=PINCH_CSV):
 def test_another_hand_loads_and_its_kinematics_equal_mujoco(tmp_path):
     """Its layout is written row by row, right first, with a spreadsheet's byte order mark and Windows' line ends."""
     hand = load_hand(write_pinch(tmp_path, layout="\ufeff" + PINCH_CSV.replace("\n", "\r\n")))
+    check_kinematics(hand)
     assert hand.joint_names == ("left_a", "right_a", "right_b", "left_b") and hand.root_joint.tolist() == [0, 2]
     np.testing.assert_allclose(hand.joint_upper, np.radians([60, 60, 80, 80]), rtol=1e-6)
     np.testing.assert_allclose(hand.torque_limit, [0.5, 0.5, 0.3, 0.3])
@@ -267,7 +207,6 @@ def test_another_hand_loads_and_its_kinematics_equal_mujoco(tmp_path):
     assert "stand" not in hand.body_names and hand.taxel_position.shape == (2, 12, 3)
     np.testing.assert_allclose(hand.taxel_position[1, 2 * 4 + 3], [0.002, 0.006, 0.01], rtol=1e-6)
     assert {g.name for g in hand.geoms if g.touches} == {"base", "right_pad", "left_pad"}
-    check_against_mujoco(hand, jax.jit(lambda joints: forward_kinematics(hand, joints)))
 
 
 # --- broken files ------------------------------------------------------------------------------

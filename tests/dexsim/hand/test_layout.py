@@ -104,7 +104,7 @@ def test_taxels_inside_the_link_are_refused(hand):
     patch = layout.on_surface("capsule", layout.lattice(5, 6, pitch=0.002), radius=0.008, half_length=0.006)
     layout.check_outside(patch, finger)
     sunk = layout.placed(patch, position=(-0.002, 0, 0))
-    words = r"^tip: taxel column \d, row \d lies 2(\.0)? mm inside its link \(\d+ of 30 do\)$"
+    words = r"^tip: taxel column \d, row \d lies 2(\.0)? mm inside its link \(\d+ of 30\)$"
     with pytest.raises(AssetError, match=words):
         layout.check_outside(sunk, finger, name="tip")
 

@@ -12,7 +12,6 @@ from dexsim.objects.params import (
     damping_ratio,
     extent,
     sample_object,
-    toward_nominal,
     unit_inertia,
 )
 
@@ -205,17 +204,6 @@ def bounce(ratio, step=1e-5):
 def test_damping_ratio_bounces_as_it_should(restitution):
     ratio = float(damping_ratio(jnp.float32(restitution)))
     assert bounce(ratio) == pytest.approx(restitution, rel=0.01)
-
-
-def test_a_nominal_object_bounces_in_the_middle_of_its_range():
-    """At scale 0 of a curriculum; at 0.5 its damping ratio is halfway to the drawn one."""
-    config = ObjectConfig(shapes=("sphere",), restitution=(0.2, 0.4))
-    drawn = sample_object(jax.random.key(0), config)
-    narrow, half = (
-        float(toward_nominal(drawn, config, unit_inertia(drawn), jnp.float32(scale)).contact[1]) for scale in (0.0, 0.5)
-    )
-    assert bounce(narrow) == pytest.approx(0.3, rel=0.01)
-    assert half == pytest.approx((narrow + float(drawn.contact[1])) / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize(("shape", "slot"), [("sphere", CAPSULE), ("box", BOX), ("cylinder", CYLINDER)])
