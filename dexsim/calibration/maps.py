@@ -201,8 +201,8 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        says = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({says:.100})") from None
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({what:.100})") from None
     own = calibration.hand, calibration.joint_names, calibration.finger_names
     if hand is not None and own != (hand.name, hand.joint_names, hand.finger_names):
         raise CalibrationError(

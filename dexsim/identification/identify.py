@@ -201,9 +201,9 @@ def uncertainty(
     """
     relative = jacobian * size
     _, singular, right = np.linalg.svd(relative, full_matrices=False)
-    known = singular > _NULL * singular[0]
-    null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~known]]
-    inverse = (right[known].T / singular[known] ** 2) @ right[known]
+    determined = singular > _NULL * singular[0]
+    null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
+    inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
     freedom = max(len(residual) - len(size), 1)
     white = inverse * np.sum(residual**2) / freedom
     score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)

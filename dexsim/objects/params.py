@@ -226,8 +226,8 @@ _RESTITUTIONS = restitution(_RATIOS)
 def damping_ratio(restitution: jax.Array) -> jax.Array:
     """Damping ratio [...], at most 3, of a contact that bounces with this restitution [...]; MuJoCo has no such
     parameter."""
-    known, ratios = (jnp.asarray(row[::-1], jnp.float32) for row in (_RESTITUTIONS, _RATIOS))
-    return jnp.interp(restitution, known, ratios)
+    restitutions, ratios = (jnp.asarray(row[::-1], jnp.float32) for row in (_RESTITUTIONS, _RATIOS))
+    return jnp.interp(restitution, restitutions, ratios)
 
 
 def _sample_slots(

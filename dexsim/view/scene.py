@@ -37,9 +37,9 @@ class Scene:
         server.scene.configure_default_lights(True, cast_shadow=False)
         server.scene.add_light_ambient("/light", intensity=1.2)
         # Farther away than a film's camera, and to the right: the controls cover that part of the page.
-        seen = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
-        aside = _ASIDE * seen.axes[0]
-        server.initial_camera.position = tuple(seen.origin + aside)
+        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
+        aside = _ASIDE * eye.axes[0]
+        server.initial_camera.position = tuple(eye.origin + aside)
         server.initial_camera.look_at = tuple(view.target + aside)
         server.initial_camera.fov = float(np.deg2rad(view.field_of_view))
         self._links = [server.scene.add_frame(f"/hand/{name}", show_axes=False) for name in hand.body_names]

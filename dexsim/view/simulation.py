@@ -52,8 +52,8 @@ class PolicyShelf:
         if name == NONE:
             return None
         time = 0.0 if name in self._shipped else _changed(Path(name))
-        known, policy = self._loaded.get(name, (-1.0, None))
-        if time != known:
+        read, policy = self._loaded.get(name, (-1.0, None))
+        if time != read:
             with contextlib.suppress(CheckpointError, OSError):  # being replaced: keep its last sound policy
                 new = load_policy(name)
                 policy = new if new.observation_layout == self._layout else None

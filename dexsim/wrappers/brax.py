@@ -79,12 +79,12 @@ class BraxEnv(Env):
 
     def restart(self, state: State, done: jax.Array) -> State:
         """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
-        begun = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
-        return begun.replace(
+        restarted = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
+        return restarted.replace(
             reward=state.reward,
             done=state.done,
             metrics=state.metrics,
-            info={**begun.info, "time_limit": state.info["time_limit"]},
+            info={**restarted.info, "time_limit": state.info["time_limit"]},
         )
 
     @property
