@@ -64,7 +64,6 @@ LONGEST = (
     "test_docs",
     "test_press_fit",
     "test_env_options",
-    "test_calibrate_failures",
     "test_rotate",
     "test_grid",
     "test_no_silent_success",

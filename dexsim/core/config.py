@@ -35,8 +35,6 @@ def setting(
     Numbers inside a tuple are each held to the range.
     """
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices}
-    if dataclasses.is_dataclass(default) or isinstance(default, (list, dict)):
-        return dataclasses.field(default_factory=lambda: default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 

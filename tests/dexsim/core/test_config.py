@@ -74,33 +74,6 @@ def test_a_wrong_value_is_named_with_its_range_in_code_and_in_a_file(fields, exp
     assert message(from_dict, Chair, {"legs": 4, "seat": fields}) == expected
 
 
-def nested_configs(cls):
-    yield cls
-    for field in dataclasses.fields(cls):
-        hint = typing.get_type_hints(cls)[field.name]
-        if dataclasses.is_dataclass(hint):
-            yield from nested_configs(hint)
-
-
-def test_every_number_of_the_grasp_config_has_a_range_that_is_enforced():
-    """Whatever the field, a value far below and far above is refused, by name."""
-    checked = 0
-    for cls in set(nested_configs(GraspConfig)):
-        for field in dataclasses.fields(cls):
-            value = getattr(cls(), field.name)
-            first = value[0] if isinstance(value, tuple) and value else value
-            if isinstance(first, (bool, str)) or not isinstance(first, (int, float)):
-                continue
-            for bad in (-1e9, 1e9):
-                bad = type(first)(bad)
-                text = message(cls, **{field.name: (bad,) * len(value) if isinstance(value, tuple) else bad})
-                assert f"{cls.__name__}.{field.name} = {bad:.0f}" in text
-                unit = field.metadata["unit"]
-                assert unit in ("", "1") or unit in text
-            checked += 1
-    assert checked > 60
-
-
 # --- dictionaries ------------------------------------------------------------------------------------
 
 
