@@ -10,7 +10,7 @@ import scipy.signal
 import scipy.stats
 
 from dexsim.core.errors import CalibrationError, ConfigError
-from dexsim.identification.excitation import Excitation, chirp, excitation, joint_excitation, steps, triangles
+from dexsim.identification.excitation import Excitation, excitation, joint_excitation
 from dexsim.identification.identify import FIT, check_log, evaluate, identify, uncertainty
 from dexsim.identification.joint import PARAMETERS, JointLog, simulate, with_defaults
 
@@ -46,20 +46,6 @@ def log_of(truth, seed=0, target=TARGET, latency=2, noise=0.001, torque_noise=0.
 
 
 # --- excitation ----------------------------------------------------------------------------------
-
-
-def test_signals_are_what_their_names_say():
-    wave = chirp(4.0, 0.001, (1.0, 5.0))
-    crossings = np.flatnonzero(np.diff(np.sign(wave)) > 0) * 0.001
-    periods = np.diff(crossings)
-    assert 1 / periods[0] == pytest.approx(1.5, abs=0.5) and 1 / periods[-1] == pytest.approx(5.0, abs=0.4)
-    # Phase 2 pi (f0 t + (f1 - f0) t^2 / 2T): 12 whole turns in 4 s.
-    assert len(crossings) == pytest.approx(12, abs=1)
-    assert np.abs(wave).max() <= 1.0 and wave[0] == 0
-    np.testing.assert_array_equal(steps(3, 0.2, 0.1), [1, 1, -1, -1, 1 / 3, 1 / 3])
-    slow = triangles(2, 4.0, 0.01)
-    assert slow[0] == 0 and slow.max() == pytest.approx(1) and slow.min() == pytest.approx(-1)
-    np.testing.assert_allclose(np.unique(np.round(np.abs(np.diff(slow)), 9)), [0.01])
 
 
 def test_the_hand_stays_within_its_limits(hand):
