@@ -1,4 +1,4 @@
-"""What drawing a range by itself changes: in the episode's draw or the compiled model, and then in motion and readings."""
+"""What drawing a range by itself changes: in the draw or the compiled model, and then in motion and readings."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
