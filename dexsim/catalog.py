@@ -1,7 +1,6 @@
 """The command `dexsim tasks`: what there is to train, on which hands, and which policies are shipped."""
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 
 from dexsim.core import cli
@@ -24,12 +23,7 @@ def catalog() -> dict[str, list[str]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    cli.parse(
-        CatalogArguments,
-        sys.argv[1:] if argv is None else argv,
-        prog="dexsim tasks",
-        description="List tasks, hands and shipped policies.",
-    )
+    cli.parse(CatalogArguments, argv, prog="dexsim tasks", description="List tasks, hands and shipped policies.")
     for kind, names in catalog().items():
         print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
     return 0

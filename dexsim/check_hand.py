@@ -3,7 +3,6 @@
 python -m dexsim.check_hand my_hand.toml
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,11 +111,11 @@ def describe(hand: Hand) -> list[str]:
         columns, rows = hand.taxel_grid
         lines.append(f"  {name:15s} {columns:3d} x {rows:3d} {1e6 * hand.taxel_area[finger].sum():18.0f}")
     pairs = mujoco.MjModel.from_xml_path(str(hand.model_path)).npair
-    return [
-        *lines,
+    lines.append(
         f"self-collision: {pairs} pairs. Links touch each other where a <pair> in the MJCF says so; contype and "
-        "conaffinity only say what touches the object",
-    ]
+        "conaffinity only say what touches the object"
+    )
+    return lines
 
 
 def report(path: Path) -> tuple[list[str], bool]:
@@ -152,12 +151,8 @@ class CheckHandArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns 0 if the hand passes, else 1."""
-    arguments = cli.parse(
-        CheckHandArguments,
-        sys.argv[1:] if argv is None else argv,
-        prog="python -m dexsim.check_hand",
-        description="Check the TOML of a hand and the files that it names.",
-    )
+    description = "Check the TOML of a hand and the files that it names."
+    arguments = cli.parse(CheckHandArguments, argv, prog="python -m dexsim.check_hand", description=description)
     lines, passed = report(arguments.hand)
     print("\n".join(lines))
     return 0 if passed else 1

@@ -1,9 +1,8 @@
 """The motor current of the simulated hand: a known truth for calibration and identification.
 
-Torques and speeds are the joint's; the gear ratio is in the torque constant. A gear passes power
-with losses: motoring, the motor must give torque / efficiency; driven back, only
-torque * back_efficiency holds it. On top comes the current that the motor draws without load, in
-the direction of motion. Commutation makes the torque constant ripple with the angle.
+Torques and speeds are the joint's; the gear ratio is in the torque constant. A gear passes power with losses: motoring,
+the motor must give torque / efficiency; driven back, only torque * back_efficiency holds it. On top comes the current
+that the motor draws without load, in the direction of motion. Commutation makes the torque constant ripple.
 
     i = torque / (K (1 + r sin(n q + phase))) * (1 / eta_f motoring, eta_b driven back)
         + i_0 direction + bias

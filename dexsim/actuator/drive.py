@@ -1,9 +1,8 @@
 """The joint drive: PD law, backlash dead-band, torque-speed envelope, efficiency, latency.
 
-The four equations of the paper (section Actuator Model Randomization), evaluated at every
-physics sub-step, and beside them what the paper's text names and leaves out: torque ripple, an
-encoder that is off, friction in the gear. Every parameter is a pytree leaf, so it can be drawn
-per joint and per episode, differentiated and fitted.
+The four equations of the paper (section Actuator Model Randomization), evaluated at every physics sub-step, and what
+the paper's text names and leaves out: torque ripple, an encoder that is off, friction in the gear. Every parameter is a
+pytree leaf: drawn per joint and episode, differentiated, fitted.
 """
 
 import jax
@@ -96,13 +95,11 @@ def at_limit(
 def apply_friction(
     actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: Array | float
 ) -> jax.Array:
-    """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step.
+    """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step, stable for any friction.
 
-    The joint alone, without contacts, would end the sub-step at the momentum rate
-    p = I qd / dt + tau. Coulomb friction takes up to c of it, so it stops the joint and then
-    holds it, and cannot turn it round; viscous friction shrinks the rest by 1 / (1 + b dt / I).
-    Stable for any friction. A load that is not in `torque` (contact, gravity) is not held but
-    creeps at load dt / I.
+    The joint alone, without contacts, would end the sub-step at the momentum rate p = I qd / dt + tau. Coulomb friction
+    takes up to c of it, so it stops the joint and then holds it, and cannot turn it round; viscous friction shrinks the
+    rest by 1 / (1 + b dt / I). A load that is not in `torque` (contact, gravity) is not held but creeps at load dt / I.
 
     Args:
       torque: Nm, of the drive.

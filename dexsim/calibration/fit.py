@@ -33,17 +33,12 @@ def calibrate(
     handedness: str = "",
     created: str | None = None,
 ) -> Calibration:
-    """Fit all joints of a hand.
+    """Fit all joints of a hand, from recordings by joint name: on the hand force against motor current (A), in
+    simulation against joint torque (Nm), pressed at the same place.
 
     Joints that were not recorded on both sides (a fingertip's pad does not load every joint) get the mean of those with
-    the same torque limit, with intervals that allow for it, and a note.
-
-    Args:
-      hand: names, torque limits.
-      real: by joint name, force against motor current (A).
-      sim: by joint name, force against joint torque (Nm), pressed at the same place.
-      force_per_count: N, scalar or [F]; kept in the file for the taxels.
-      serial, handedness, created: kept in the file; `created` is today by default.
+    the same torque limit, with intervals that allow for it, and a note. The rest is kept in the file: `force_per_count`
+    N, scalar or [F], and `created`, by default today.
 
     Raises:
       CalibrationError: names the joint and what data is needed, or a number that no hand gives.

@@ -1,8 +1,8 @@
-"""Lines of one joint from the recording of its pressed fingertip, while loading and while unloading.
+"""Lines of one joint from the recording of its pressed fingertip.
 
-The two directions are fitted apart, because friction in the gear obeys two lines: the motor holds more than the force
-asks for on the way up, less on the way down. Samples of one press share its place, its ripple and its friction, so
-intervals count whole presses, not samples.
+Loading and unloading are fitted apart, because friction in the gear makes two lines: the motor holds more than the
+force asks for on the way up, less on the way down. Samples of one press share its place, its ripple and its friction,
+so intervals count whole presses, not samples.
 """
 
 import dataclasses
@@ -44,16 +44,11 @@ class JointLines:
 
 
 def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLines:
-    """Fit loading and unloading of one joint.
-
-    Args:
-      press: the recording.
-      unit: "A" or "Nm", of `press.value`.
-      where: named in errors.
+    """Fit loading and unloading of one joint; `unit` is "A" or "Nm", of `press.value`, `where` is named in errors.
 
     Raises:
-      CalibrationError: too few samples, not a number, no excitation, saturated, another unit, or
-        the value does not follow the force.
+      CalibrationError: too few samples, not a number, no excitation, saturated, another unit, or the value does not
+        follow the force.
     """
     force, value = _checked(press, unit, where)
     direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
@@ -64,10 +59,10 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
         keep = free & (direction == sign)
         enough = np.sum(keep) >= MIN_SAMPLES
         lines.append(_fit_direction(force[keep], value[keep], number[keep], f"{where}, {name}") if enough else None)
-    known = [line for line in lines if line is not None]
-    if not known:
+    fits = [line for line in lines if line is not None]
+    if not fits:
         raise CalibrationError(f"{where}: at least {MIN_SAMPLES} samples of rising or of falling force are needed")
-    if len(known) == 2 and known[0].gain * known[1].gain < 0:
+    if len(fits) == 2 and fits[0].gain * fits[1].gain < 0:
         raise CalibrationError(
             f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
         )
@@ -77,27 +72,21 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
     if len(np.unique(number[free & (direction != 0)])) < LEAST_GROUPS:
         notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ ({unit})")
     # 4.685: where the bisquare's weight ends, beyond which a sample is an outlier.
-    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in known], 0)
+    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in fits], 0)
     friction = float("nan")
-    if len(known) == 2:
+    if len(fits) == 2:
         middle = (np.min(force[sound]) + np.max(force[sound])) / 2
-        friction = float(abs(known[0](middle) - known[1](middle)) / 2)
+        friction = float(abs(fits[0](middle) - fits[1](middle)) / 2)
     loading, unloading = (line and line.widened(press.gain_error) for line in lines)
-    return JointLines(
-        loading,
-        unloading,
-        friction,
-        float(np.max(np.abs(value[sound]))),
-        float(np.max(force[sound])),
-        tuple(notes),
-    )
+    value_max, force_max = float(np.max(np.abs(value[sound]))), float(np.max(force[sound]))
+    return JointLines(loading, unloading, friction, value_max, force_max, tuple(notes))
 
 
 def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
     """1 while the force [T] rises, -1 while it falls, 0 just after a turn; in the order of time.
 
-    Turns are the extremes that stand out of the noise. The first `trim` of each swing is marked 0:
-    there the gear's friction is on its way from one side to the other.
+    Turns are the extremes that stand out of the noise. In the first `trim` of each swing the gear's friction is on its
+    way from one side to the other.
     """
     smooth, turns, sign = _swings(force)
     direction = np.zeros(len(smooth), int)
@@ -164,9 +153,8 @@ def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.n
 def _check_range(force: np.ndarray, where: str) -> None:
     low, high = np.quantile(force, [0.05, 0.95])
     if high - low < MIN_FORCE_RANGE:
-        raise CalibrationError(
-            f"{where}: force stays between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
-        )
+        stays = f"force stays between {low:.3g} and {high:.3g} N"
+        raise CalibrationError(f"{where}: {stays}: press over at least {MIN_FORCE_RANGE} N")
 
 
 def _not_saturated(size: np.ndarray, where: str, name: str) -> np.ndarray:
@@ -202,9 +190,7 @@ def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
     notes, names = [], ("loading", "unloading")
     for line, name, other in zip(lines, names, names[::-1], strict=True):
         if line is None:
-            notes.append(
-                f"no {name} recorded ({unit}): friction and offset are not apart, the {other} line stands for both"
-            )
+            notes.append(f"no {name} recorded ({unit}): friction and offset are not apart, {other} stands for both")
             continue
         width = (line.gain_interval[1] - line.gain_interval[0]) / 2
         if width > 0.1 * abs(line.gain):

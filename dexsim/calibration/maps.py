@@ -27,7 +27,7 @@ from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.kinematics import Hand
 
 FORMAT = "dexsim calibration"
-VERSION = 1
+VERSION = 2
 
 
 @pytree_dataclass
@@ -151,40 +151,29 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
 
 # --- file -----------------------------------------------------------------------------------
 
-_SINGLES = ("friction", "value_max", "force_max")
-_PAIRS = tuple(field.name for field in dataclasses.fields(Side) if field.name not in _SINGLES)
-_FORCE_PER_TORQUE = ("force_per_torque", "force_per_torque_low", "force_per_torque_high")
+_WORDS = ("hand", "serial", "handedness", "created", "joint_names", "finger_names", "notes")
+_UNITS = {
+    "current_per_count": "A",
+    "torque_scale": "Nm, of each joint",
+    "force_per_count": "N, of each finger",
+    "force_per_torque": "N/Nm, of each finger: value, 95 % low and high; 0: not pressed",
+}
+_ONE_A_JOINT = ("friction", "value_max", "force_max")
+_SIDES = """
+# Lines value = gain * force + offset of all joints, loading and then unloading: value in A on the hand (real), in Nm in
+# simulation (sim), force in N. Intervals are of 95 %."""
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
-    lines = [
-        f"format = {_text(FORMAT)}",
-        f"version = {VERSION}",
-        *(f"{name} = {_text(getattr(calibration, name))}" for name in ("hand", "serial", "handedness", "created")),
-        f"current_per_count = {_numbers(calibration.current_per_count)}  # A",
-        f"finger_names = {_text(calibration.finger_names)}",
-        f"force_per_count = {_numbers(calibration.force_per_count)}  # N",
-    ]
-    if calibration.force_per_torque is not None:
-        rows = zip(_FORCE_PER_TORQUE, calibration.force_per_torque, strict=True)
-        lines += [f"{name} = {_numbers(row)}  # N/Nm, 0: not pressed" for name, row in rows]
-    lines += ["notes = [", *(f"  {_text(note)}," for note in calibration.notes), "]", ""]
-    lines += [
-        "# Lines value = gain * force + offset; pairs are [loading, unloading].",
-        "# real: value in A. sim: value in Nm. Force in N. Intervals are of 95 %.",
-        "",
-    ]
-    for joint, name in enumerate(calibration.joint_names):
-        lines += [
-            "[[joint]]",
-            f"name = {_text(name)}",
-            f"torque_scale = {_numbers(calibration.torque_scale[joint])}  # Nm",
-        ]
-        for key, side in (("real", calibration.real), ("sim", calibration.sim)):
-            lines.append(f"[joint.{key}]")
-            lines += [f"{field} = {_numbers(getattr(side, field)[..., joint])}" for field in (*_PAIRS, *_SINGLES)]
-        lines.append("")
+    lines = [f'format = "{FORMAT}"', f"version = {VERSION}"]
+    lines += [f"{name} = {json.dumps(getattr(calibration, name), ensure_ascii=False)}" for name in _WORDS]
+    numbers = {name: getattr(calibration, name) for name in _UNITS}
+    lines += [f"{name} = {_text(value)}  # {_UNITS[name]}" for name, value in numbers.items() if value is not None]
+    lines.append(_SIDES)
+    for name, side in (("real", calibration.real), ("sim", calibration.sim)):
+        lines.append(f"[{name}]")
+        lines += [f"{field} = {_text(values)}" for field, values in vars(side).items()]
     lines += ["[end]", "complete = true", ""]
     try:
         write_whole(Path(path), ["\n".join(lines).encode()])
@@ -192,12 +181,8 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-def _text(value: str | tuple[str, ...]) -> str:
-    return json.dumps(value, ensure_ascii=False)  # TOML's strings are JSON's.
-
-
-def _numbers(values: Any) -> str:
-    return str(np.asarray(values, float).tolist())
+def _text(values: Any) -> str:
+    return str(np.asarray(values, float).tolist())  # Unlike JSON's, Python's nan and inf are TOML's.
 
 
 def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
@@ -216,8 +201,8 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        says = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({says:.100})") from None
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({what:.100})") from None
     own = calibration.hand, calibration.joint_names, calibration.finger_names
     if hand is not None and own != (hand.name, hand.joint_names, hand.finger_names):
         raise CalibrationError(
@@ -234,38 +219,31 @@ def _calibration(table: dict[str, Any]) -> Calibration:
         raise ValueError(f"it has version {table['version']!r:.20}, this library reads {VERSION}")
     if table["end"] != {"complete": True}:
         raise ValueError("its end is missing")
-    joints, fingers = table["joint"], tuple(map(str, table["finger_names"]))
-    force_per_torque = None
-    if "force_per_torque" in table:
-        force_per_torque = np.array([_row(table, name, len(fingers)) for name in _FORCE_PER_TORQUE])
+    words: dict[str, Any] = {
+        name: tuple(map(str, v)) if isinstance(v := table[name], list) else str(v) for name in _WORDS
+    }
+    joints, fingers = len(words["joint_names"]), len(words["finger_names"])
 
-    def side(key: str) -> Side:
-        pairs = {name: np.stack([_row(joint[key], name, 2) for joint in joints], -1) for name in _PAIRS}
-        singles = {name: np.concatenate([_row(joint[key], name, 1) for joint in joints]) for name in _SINGLES}
-        return Side(**pairs, **singles)
+    def numbers(part: dict[str, Any], name: str, *shape: int) -> np.ndarray:
+        values = np.array(part[name], float)
+        if values.shape != shape:
+            raise ValueError(f"{name!r} must hold {' x '.join(map(str, shape))} numbers")
+        return values
+
+    def side(part: dict[str, Any]) -> Side:
+        names = [field.name for field in dataclasses.fields(Side)]
+        shapes = {name: (joints,) if name in _ONE_A_JOINT else (2, joints) for name in names}
+        return Side(**{name: numbers(part, name, *shape) for name, shape in shapes.items()})
 
     return Calibration(
-        side("real"),
-        side("sim"),
-        np.concatenate([_row(joint, "torque_scale", 1) for joint in joints]),
-        _row(table, "force_per_count", len(fingers)),
-        hand=str(table["hand"]),
-        joint_names=tuple(str(joint["name"]) for joint in joints),
-        finger_names=fingers,
+        side(table["real"]),
+        side(table["sim"]),
+        torque_scale=numbers(table, "torque_scale", joints),
+        force_per_count=numbers(table, "force_per_count", fingers),
+        force_per_torque=numbers(table, "force_per_torque", 3, fingers) if "force_per_torque" in table else None,
         current_per_count=float(table["current_per_count"]),
-        serial=str(table["serial"]),
-        handedness=str(table["handedness"]),
-        created=str(table["created"]),
-        notes=tuple(map(str, table["notes"])),
-        force_per_torque=force_per_torque,
+        **words,
     )
-
-
-def _row(table: dict[str, Any], name: str, count: int) -> np.ndarray:
-    values = np.atleast_1d(np.array(table[name], float))
-    if values.shape != (count,):
-        raise ValueError(f"{name!r} must hold {count} number(s)")
-    return values
 
 
 # --- what no hand gives -----------------------------------------------------------------------

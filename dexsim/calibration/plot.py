@@ -19,13 +19,8 @@ def plot_calibration(
     sim: Mapping[str, JointPress],
     joints: tuple[str, ...] | None = None,
 ) -> None:
-    """Write a figure with one row a joint: the hand, the simulation, both normalised.
-
-    Args:
-      path: .png, .pdf or .svg.
-      calibration: fitted from these recordings.
-      real, sim: the recordings, by joint name.
-      joints: which; by default all that were recorded on both sides.
+    """Write a figure (.png, .pdf or .svg) with one row a joint: the hand, the simulation, both normalised. By default
+    of all joints that were recorded on both sides.
 
     Raises:
       CalibrationError: none of the joints was recorded on both sides.

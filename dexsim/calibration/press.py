@@ -18,12 +18,7 @@ MIN_LEVER = 0.005
 
 
 def lever_arms(hand: Hand, joint_position: np.ndarray, finger: int, taxel: int) -> np.ndarray:
-    """Torque [J] Nm per newton that the joints must give to press outward at a taxel.
-
-    Args:
-      joint_position: [J] rad.
-      finger, taxel: where; the force is along the taxel's outward normal.
-    """
+    """Torque [J] Nm per newton that the joints, at [J] rad, must give to press along a taxel's outward normal."""
     at = jnp.asarray(joint_position, jnp.float32)
     return np.asarray(_lever_arms(hand, at, jnp.int32(finger), jnp.int32(taxel)), float)
 

@@ -3,9 +3,8 @@
     fit = fit_finger(TaxelPress(force=gauge, reading=taxels))
     force = fit.correct(reading.sum(-1))
 
-The line is fitted robustly (`dexsim.core.robust_line`), to samples beyond the forces that still read zero: among them
-noise decides which samples read at all, which would bend the line. A zero far above them is a reading that was lost:
-it is left out, and the samples below it are not. Samples of one press belong together: from three
+The line is fitted robustly to samples beyond the forces that still read zero: among them noise decides which samples
+read at all, which would bend the line. A zero far above them is a reading that was lost and left out. From three
 presses on, intervals count presses and not samples.
 
 Shapes: T samples, N taxels.
@@ -109,12 +108,7 @@ def fit_skin(press: TaxelPress, depth: np.ndarray, area: np.ndarray, thickness: 
     """Mooney-Rivlin coefficient C10 + C01 of the skin in Pa, from a flat plate pressed in by a known way.
 
     Up to moderate compression only the sum of both coefficients shows, so the force is taken as all of the first term.
-
-    Args:
-      press: the gauge's force.
-      depth: [T, N] m, compression of the skin over each taxel.
-      area: [N] m^2, of each taxel.
-      thickness: m, of the skin.
+    `depth` [T, N] m is the compression of the skin over each taxel, `area` [N] m^2 its area, `thickness` m the skin's.
     """
     touching = depth.max(1) > 0
     stretch = 1 - np.maximum(depth[touching], 0) / thickness

@@ -44,13 +44,8 @@ def cache_path(name: str) -> Path:
 
 
 def cached_arrays(folder: str, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Arrays that `make` computes the first time, and a file of the cache has afterwards.
-
-    Args:
-      folder: of the cache.
-      key: says all that the arrays depend on.
-      make: names and arrays.
-    """
+    """Arrays by name that `make` computes the first time, and a file in this folder of the cache has afterwards; `key`
+    says all that they depend on."""
     path = cache_path(folder) / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npz"
     try:
         with np.load(path) as file:

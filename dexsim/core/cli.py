@@ -54,8 +54,8 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
         sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
 
-def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:
-    """Options of a dataclass, through tyro, which answers `--help` and refuses what does not parse.
+def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: str, default: T | None = None) -> T:
+    """Options of a dataclass (None: of this process), through tyro: it answers `--help`, refuses what does not parse.
 
     Raises:
       ConfigError: a value is out of range; names the option's class and field.
@@ -63,7 +63,7 @@ def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, def
     import tyro
 
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
-    return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
+    return tyro.cli(cls, args=argv, prog=prog, description=description, **kwargs)
 
 
 def announce(text: str) -> None:
@@ -134,11 +134,8 @@ def check_writable(path: Path) -> None:
 
 
 def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
-    """Check that no file which a command writes is one that it reads, or another one that it writes.
-
-    Args:
-      outputs: option to its file.
-      inputs: what it is to its file, or to a name that may be none.
+    """Check that no file which a command writes (by option) is one that it reads (by what that is), or another one that
+    it writes.
 
     Raises:
       ConfigError: there is such a file.

@@ -35,8 +35,6 @@ def setting(
     Numbers inside a tuple are each held to the range.
     """
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices}
-    if dataclasses.is_dataclass(default) or isinstance(default, (list, dict)):
-        return dataclasses.field(default_factory=lambda: default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -150,10 +148,8 @@ def naming_file(path: object) -> typing.Iterator[None]:
 
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
-    """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]".
-
-    Values are JSON, Python's literals (which have .006 and 5.), and words without quotes. `from_dict` tells whether the
-    fields exist and the values fit.
+    """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]": JSON, Python's
+    literals (which have .006 and 5.), or words without quotes. `from_dict` tells whether they fit.
 
     Raises:
       ConfigError: a setting without a name or a value.

@@ -8,13 +8,7 @@ from typing import Any
 def open_door(
     package: str, names: Sequence[str], homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """A package's `__getattr__` and `__dir__`.
-
-    Args:
-      package: the package's `__name__`.
-      names: its `__all__`.
-      homes: the module of each name that is imported late.
-    """
+    """A package's `__getattr__` and `__dir__`, from its `__name__`, its `__all__` and the modules of its late names."""
 
     def getattribute(name: str) -> Any:
         if name not in homes:

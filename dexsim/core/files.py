@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-_TOML_BYTES = 1 << 20
-
 
 def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
     """Write `chunks` one after another to `path`, and create its folder if needed.
@@ -58,14 +56,10 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file, with or without a byte order mark.
 
     Raises:
-      ValueError: no TOML, or larger than 1 MiB.
+      ValueError: no TOML.
       OSError: it cannot be read.
     """
-    with open(path, "rb") as file:
-        data = file.read(_TOML_BYTES + 1)  # a device may have no end
-    if len(data) > _TOML_BYTES:
-        raise ValueError("larger than 1 MiB")
-    return tomllib.loads(data.decode("utf-8-sig"))
+    return tomllib.loads(path.read_text(encoding="utf-8-sig"))
 
 
 def temporary_beside(path: Path) -> Path:

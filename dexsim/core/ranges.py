@@ -30,8 +30,7 @@ def uniform(
     """A random value [*shape] of a range; in an extreme episode, the end of the range on that value's side of nominal.
 
     Args:
-      key: of this value.
-      span: the range (low, high). A range that begins at its nominal value has only its far end as an extreme.
+      span: (low, high). A range that begins at its nominal value has only its far end as an extreme.
       extreme: from `sample_extreme`: bool [], or None for no extremes.
       nominal: by default the middle of the range.
       beyond: extremes lie outside the range, by up to this share of the end's distance from nominal.
@@ -57,10 +56,8 @@ def uniforms(
     nominal: Sequence[float] | None = None,
     beyond: float = 0.0,
 ) -> jax.Array:
-    """Random values [K, *shape] of K ranges, each as `uniform` draws it from its key of `keys` [K].
-
-    One draw of all compiles four times as fast as one for each. A value of a smaller shape is the beginning of its row.
-    """
+    """Random values [K, *shape] of K ranges, each as `uniform` draws it from its key of `keys` [K], compiled four times
+    as fast. A value of a smaller shape is the beginning of its row."""
     low, high = np.asarray(spans, np.float32).T
     middle = (low + high) / 2 if nominal is None else np.asarray(nominal, np.float32)
     return jax.vmap(

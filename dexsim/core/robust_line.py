@@ -1,9 +1,8 @@
 """A straight line through data with outliers, with confidence intervals.
 
-Theil-Sen start, Huber and then Tukey's bisquare by iteratively reweighted least squares (an
-MM-estimate). The interval is the wider of two: of a sandwich covariance that allows for unequal and
-autocorrelated residuals (Andrews and Monahan 1992), and of a jackknife over whole repetitions, which sees what
-differs between them however the residuals within one belong together. Plain NumPy in double precision.
+Theil-Sen start, Huber and then Tukey's bisquare by iteratively reweighted least squares (an MM-estimate). The interval
+is the wider of two: of a sandwich covariance that allows for unequal and autocorrelated residuals (Andrews and Monahan
+1992), and of a jackknife over whole repetitions, which sees what differs between them.
 """
 
 import dataclasses
@@ -57,19 +56,18 @@ class Regression:
     scale: float  # robust standard deviation of the residuals
 
 
-def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, seed: int = 0) -> Line:
+def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None) -> Line:
     """Fit y = gain x + offset.
 
     Args:
       x, y: [T], finite and in order of time; T > 2 and x not constant.
       group: [T] int, number of the repetition (a press) that a sample belongs to. From `LEAST_GROUPS` on, their
         differences widen the intervals.
-      seed: of the random pairs for Theil-Sen, if there are more than 20,000 pairs.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     reach = np.max(np.abs(x))
     design = np.stack([np.ones_like(x), x / reach], -1)
-    start = np.array(theil_sen(x, y, seed)) * [1.0, reach]
+    start = np.array(theil_sen(x, y)) * [1.0, reach]
     fit = regress(design, y, start, order=x, group=group)
     weight, residual = fit.weight, y - design @ fit.value
     (offset, gain), half = fit.value / [1.0, reach], fit.half / [1.0, reach]
@@ -110,13 +108,13 @@ def regress(
     return Regression(guess, half, weight, scale)
 
 
-def theil_sen(x: np.ndarray, y: np.ndarray, seed: int = 0) -> tuple[float, float]:
+def theil_sen(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Offset and gain: the median slope over pairs of samples, and the median residual."""
     count = len(x)
     if count * (count - 1) // 2 <= _PAIRS:
         first, second = np.triu_indices(count, 1)
     else:
-        first, second = np.random.default_rng(seed).integers(0, count, (2, _PAIRS))
+        first, second = np.random.default_rng(0).integers(0, count, (2, _PAIRS))
     run = x[second] - x[first]
     far = np.abs(run) > 0.1 * np.ptp(x)  # close pairs hold only noise
     gain = float(np.median((y[second] - y[first])[far] / run[far]))
@@ -128,12 +126,15 @@ def _reweight(design: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.
     guess = start
     floor = 1e-12 * max(float(np.max(np.abs(y))), 1e-300)
     scale = floor
-    for bound, weigh in ((_HUBER, _huber_weight), (_BISQUARE, _bisquare_weight)):
+    for huber in (True, False):
         for _ in range(50):
             residual = y - design @ guess
-            if weigh is _huber_weight:  # the bisquare keeps the scale, which might shrink without end
+            if huber:  # the bisquare keeps the scale, which might shrink without end
                 scale = max(_MAD * float(np.median(np.abs(residual))), floor)
-            weight = weigh(residual / (bound * scale))
+                weight = 1.0 / np.maximum(np.abs(residual / (_HUBER * scale)), 1.0)
+            else:
+                u = residual / (_BISQUARE * scale)
+                weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
             root = np.sqrt(weight)
             new = np.linalg.lstsq(root[:, None] * design, root * y, rcond=None)[0]
             done = np.all(np.abs(new - guess) <= 1e-10 * (np.abs(new) + scale))
@@ -141,14 +142,6 @@ def _reweight(design: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.
             if done:
                 break
     return guess, scale, weight
-
-
-def _huber_weight(u: np.ndarray) -> np.ndarray:
-    return 1.0 / np.maximum(np.abs(u), 1.0)
-
-
-def _bisquare_weight(u: np.ndarray) -> np.ndarray:
-    return np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
 
 
 def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
@@ -167,10 +160,7 @@ def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, s
 
 
 def _between_groups(design: np.ndarray, y: np.ndarray, guess: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Half the 95 % interval [P] by the jackknife over whole groups; 0 with too few of them.
-
-    Few groups make Student's t quantile large, which is what few repetitions are worth.
-    """
+    """Half the 95 % interval [P] by the jackknife over whole groups; 0 with too few of them."""
     number = np.unique(group, return_inverse=True)[1]
     count = int(number.max()) + 1
     if count < LEAST_GROUPS:
@@ -183,22 +173,16 @@ def _between_groups(design: np.ndarray, y: np.ndarray, guess: np.ndarray, group:
 
 
 def _periodic(design: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Variance [P] of the parameters over the phase along x of a periodic residual.
-
-    A ripple of a few periods neither averages out nor has a decaying autocovariance. So the residuals are
-    shifted cyclically along x by every offset, and fitted each time.
-    """
+    """Variance [P] of the parameters over all cyclic shifts of the residuals along x: a ripple of a few periods neither
+    averages out nor has a decaying autocovariance."""
     spectrum = np.fft.rfft(design, axis=0).conj() * np.fft.rfft(residual)[:, None]
     turned = np.fft.irfft(spectrum, n=len(residual), axis=0)  # design.T @ roll(residual, offset)
     return np.mean((turned @ inverse) ** 2, 0)
 
 
 def long_run(score: np.ndarray) -> np.ndarray:
-    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T.
-
-    Newey-West on the series without its first-order autoregression (Andrews and Monahan
-    1992), bandwidth after Andrews 1991.
-    """
+    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T: Newey-West on the series without
+    its first-order autoregression (Andrews and Monahan 1992), bandwidth after Andrews 1991."""
     count = len(score)
     rho = _autocorrelation(score)
     white = score[1:] - rho * score[:-1]
@@ -213,9 +197,7 @@ def long_run(score: np.ndarray) -> np.ndarray:
 
 
 def _autocorrelation(series: np.ndarray) -> np.ndarray:
-    """First-order coefficient [P] of each column, corrected for its bias in short series.
-
-    Correlation over more than a quarter of the series is not to be told from a trend.
-    """
+    """First-order coefficient [P] of each column, corrected for its bias in short series. Correlation over more than a
+    quarter of the series is not to be told from a trend."""
     rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
     return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))

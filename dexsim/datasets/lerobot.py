@@ -16,7 +16,7 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.core.files import temporary_beside
-from dexsim.core.install import install_line
+from dexsim.core.install import require
 from dexsim.datasets.trajectory import Trajectory
 from dexsim.hand.kinematics import Hand
 
@@ -34,11 +34,8 @@ def check_lerobot(folder: Path) -> None:
       DexsimError: pyarrow or pandas is not installed, or the folder exists.
       OSError: its parent is no folder, or cannot be made.
     """
-    try:
-        import pandas  # noqa: F401
-        import pyarrow.parquet  # noqa: F401
-    except ImportError:
-        raise DexsimError(f"the LeRobot format needs pyarrow and pandas: {install_line('lerobot')}") from None
+    for module in ("pyarrow", "pandas"):
+        require(module, "lerobot", "the LeRobot format")
     if folder.exists() or folder.is_symlink():
         raise DexsimError(f"{folder}: exists already; name another folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -93,9 +90,8 @@ def _write(folder: Path, hand: Hand, task: str, whole: dict[str, np.ndarray], ep
 
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True)
-    parquet.write_table(
-        pyarrow.table({name: _column(pyarrow, values) for name, values in whole.items()}), folder / "data" / _FILE
-    )
+    table = pyarrow.table({name: pyarrow.array(values.tolist(), _type(values)) for name, values in whole.items()})
+    parquet.write_table(table, folder / "data" / _FILE)
     parquet.write_table(pyarrow.Table.from_pylist(episodes), folder / "meta" / "episodes" / _FILE)
     pandas.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta" / "tasks.parquet")
     for name, content in {
@@ -171,11 +167,6 @@ def _tactile(hand: Hand) -> dict[str, Any]:
 
 def _episode(number: int, begin: int, length: int, task: str, frames: dict[str, np.ndarray]) -> dict[str, Any]:
     """A row of `meta/episodes`."""
-    statistics = {
-        f"stats/{name}/{which}": value
-        for name, values in frames.items()
-        for which, value in _statistics(values).items()
-    }
     return {
         "episode_index": number,
         "tasks": [task],
@@ -186,7 +177,11 @@ def _episode(number: int, begin: int, length: int, task: str, frames: dict[str, 
         "dataset_to_index": begin + length,
         "meta/episodes/chunk_index": 0,
         "meta/episodes/file_index": 0,
-        **statistics,
+        **{
+            f"stats/{name}/{which}": value
+            for name, values in frames.items()
+            for which, value in _statistics(values).items()
+        },
     }
 
 
@@ -199,12 +194,10 @@ def _statistics(values: np.ndarray) -> dict[str, Any]:
     return {name: value.tolist() for name, value in summary.items()} | {"count": [len(values)]}
 
 
-def _column(pyarrow: Any, values: np.ndarray) -> Any:
-    return pyarrow.array(values.tolist(), _type(pyarrow, values))
-
-
-def _type(pyarrow: Any, values: np.ndarray) -> Any:
+def _type(values: np.ndarray) -> Any:
     """Nested lists of the array's own number type."""
+    import pyarrow
+
     kind = pyarrow.from_numpy_dtype(values.dtype)
     for _ in values.shape[1:]:
         kind = pyarrow.list_(kind)

@@ -29,14 +29,7 @@ def check_rerun() -> Any:
 
 
 def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path | None = None) -> None:
-    """Show signals, and taxels as pictures.
-
-    Args:
-      hand: the hand.
-      time: [T] s.
-      series: the signals.
-      taxel_force: [T, F, N] N.
-      path: recording to write; None opens the viewer.
+    """Show signals at times [T] s, and taxels [T, F, N] N as pictures, in the viewer or in a recording at `path`.
 
     Raises:
       DexsimError: rerun is not installed.

@@ -22,10 +22,7 @@ class Trajectory:
     def at_rate(self, rate: float) -> "Trajectory":
         """The same at another rate, Hz: of each instant the nearest tick."""
         instants = np.arange(int(self.time[-1] * rate) + 1) / rate
-        after = np.clip(np.searchsorted(self.time, instants), 1, max(len(self.time) - 1, 1))
-        after = np.minimum(after, len(self.time) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(instants - self.time[before] <= self.time[after] - instants, before, after)
+        nearest = np.rint(np.interp(instants, self.time, np.arange(len(self.time)))).astype(int)
         fields = {field.name: getattr(self, field.name)[nearest] for field in dataclasses.fields(self)}
         return Trajectory(**fields | {"time": instants})
 

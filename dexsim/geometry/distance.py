@@ -19,11 +19,7 @@ from dexsim.core.pytree import Array
 from dexsim.geometry import grid, sdf, surface_points
 
 METHODS = ("closed_form", "grid", "surface_points")
-_MODULES: dict[type, Any] = {
-    sdf.Shape: sdf,
-    grid.Grid: grid,
-    surface_points.SurfacePoints: surface_points,
-}
+_MODULES: dict[type, Any] = {sdf.Shape: sdf, grid.Grid: grid, surface_points.SurfacePoints: surface_points}
 
 
 def signed_distance(points: Array, geometry: Any) -> jax.Array:

@@ -34,20 +34,14 @@ class Grid:
     """Distances on nodes. `scale` may differ per environment, the rest is shared."""
 
     nodes: int = static()
-    values: (
-        jax.Array
-    )  # [n, n^2, 8] mm: the corners of the cell that begins at each node, side by side; 8 MB at 64 nodes
+    values: jax.Array  # [n, n^2, 8] mm: the corners of the cell that begins at each node; 8 MB at 64 nodes
     origin: jax.Array  # [3] m, the first node
     spacing: jax.Array  # [3] m
     scale: jax.Array  # [] the object's size relative to the baked one
 
 
 def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES) -> Grid:
-    """The grid of an object; what was computed from a mesh is lowered in the cache (`sdf`).
-
-    Args:
-      source: a checked mesh (`mesh.load_mesh`) or a union of primitives with known sizes.
-      nodes: along each axis.
+    """The grid of a checked mesh (`mesh.load_mesh`) or of a union of primitives; that of a mesh is kept in the cache.
 
     Raises:
       AssetError: the mesh cannot be signed.
@@ -57,7 +51,7 @@ def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES) -> Grid:
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     if isinstance(source, meshes.Mesh):
         key = f"{source.fingerprint} {nodes} {PAD!r} {_VERSION}"
-        distance = cached_arrays("sdf", key, lambda: {"distance": _measure(source, points)})["distance"]
+        distance = cached_arrays("sdf", key, lambda: _measure(source, points))["distance"]
     else:
         distance = np.asarray(sdf.signed_distance(jnp.asarray(points, jnp.float32), source))
     lowered = ((distance - _overshoot(distance, axes)) / _MILLI).astype(np.float32)
@@ -148,7 +142,7 @@ def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     return np.where(smooth, total, 0.0).reshape(-1)
 
 
-def _measure(mesh: meshes.Mesh, points: np.ndarray) -> np.ndarray:
+def _measure(mesh: meshes.Mesh, points: np.ndarray) -> dict[str, np.ndarray]:
     """Exact distance at the nodes, m."""
     meshes.check_sign(mesh)
-    return meshes.signed_distance(mesh, points)[0].astype(np.float32)
+    return {"distance": meshes.signed_distance(mesh, points)[0].astype(np.float32)}

@@ -1,8 +1,7 @@
 """Triangle meshes: checked at the door, and their exact signed distance in NumPy (for baking and for tests).
 
 The sign comes from the angle-weighted pseudo-normal at the nearest point (Baerentzen and Aanaes 2005), which is exact
-for a closed mesh that does not cut through itself. `check_sign` compares it with the winding number, which knows
-nothing of nearest points, and refuses a mesh where the two disagree.
+for a closed mesh that does not cut through itself; `check_sign` compares it with the winding number.
 
 Shapes: V vertices, T triangles, P points. Units: m, float64.
 """
@@ -108,10 +107,7 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Me
 
 
 def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact distance [P] m, negative inside, and its gradient [P, 3], at points [P, 3].
-
-    At a point on the surface the gradient is the pseudo-normal.
-    """
+    """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface the pseudo-normal), at points."""
     points = np.asarray(points, np.float64).reshape(-1, 3)
     nearest, normal = find_nearest(mesh, points)
     apart = points - nearest
@@ -206,16 +202,11 @@ def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: floa
         raise AssetError(f"{name}: the surface is open; close it (trimesh.repair) or use its convex hull")
     if not surface.is_winding_consistent:
         raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
-    volume = _volume(vertices[faces])
+    volume = float(surface.volume)
     if abs(volume) < 1e-6 * size**3:
         raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
     if volume < 0:
         raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
-
-
-def _volume(corners: np.ndarray) -> float:
-    a, b, c = np.moveaxis(corners - corners.mean((0, 1)), 1, 0)
-    return float(np.sum(a * np.cross(b, c)) / 6)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

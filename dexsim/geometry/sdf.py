@@ -1,12 +1,11 @@
 """Signed distances to closed-form primitives and their unions.
 
-Sizes are MuJoCo's: box half-extents; capsule and cylinder (radius, half-length, -) along z;
-sphere (radius, -, -); ellipsoid semi-axes. Distances are negative inside. They are exact, but
-for points inside an overlap of several primitives, where a union gives the depth below the
-nearest of their surfaces, not below the outer one.
+Sizes are MuJoCo's: box half-extents; capsule and cylinder (radius, half-length, -) along z; sphere (radius, -, -);
+ellipsoid semi-axes. Distances are negative inside, and exact but for points inside an overlap of several primitives,
+where a union gives the depth below the nearest of their surfaces, not below the outer one.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -83,13 +82,7 @@ def ellipsoid(point: Array, size: Array) -> jax.Array:
     return jnp.sum(normal * (sign * point - size * unit), -1)
 
 
-_DISTANCE: dict[str, Callable[[Array, Array], jax.Array]] = {
-    "sphere": sphere,
-    "box": box,
-    "capsule": capsule,
-    "cylinder": cylinder,
-    "ellipsoid": ellipsoid,
-}
+_DISTANCE = {"sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder, "ellipsoid": ellipsoid}
 
 
 def primitive_distance(kind: str, points: Array, size: Array) -> jax.Array:
@@ -111,11 +104,8 @@ def signed_distance(points: Array, shape: Shape) -> jax.Array:
 
 
 def to_local(points: Array, position: Array, rotation: Array) -> jax.Array:
-    """Points [..., 3] in the frame at `position` [3], `rotation` [3, 3].
-
-    Component by component: XLA then makes one kernel of transform and distance, where sums over an
-    axis of three would each write their result to memory.
-    """
+    """Points [..., 3] in the frame at `position` [3], `rotation` [3, 3]: component by component, so that XLA makes one
+    kernel of transform and distance."""
     arm = [p - position[axis] for axis, p in enumerate(_split(points))]
     return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3)) for axis in range(3)], -1)
 
@@ -144,9 +134,8 @@ def bounds(shape: Shape) -> np.ndarray:
     if not active.size:
         raise ConfigError("bounds: no active primitive")
     position = np.asarray(shape.position, float)[active]
-    reach = np.stack(
-        [_reach(shape.kinds[k], np.asarray(shape.size[k], float), np.asarray(shape.rotation[k], float)) for k in active]
-    )
+    size, turn = np.asarray(shape.size, float), np.asarray(shape.rotation, float)
+    reach = np.stack([_reach(shape.kinds[k], size[k], turn[k]) for k in active])
     return np.stack([(position - reach).min(0), (position + reach).max(0)])
 
 

@@ -3,9 +3,6 @@
 With p_o the surface point nearest to a taxel p and n_o its outward normal, the signed distance is (p - p_o) . n_o: the
 taxel touches where that is negative (paper, section Sim-to-Real Transfer).
 
-The scan holds a block of points in the program's registers at a time and keeps, per taxel, the best so far: taxels x
-points never reaches memory, and positions may be traced.
-
 Shapes: N points. Units: m.
 """
 
@@ -154,17 +151,12 @@ def _cylinder_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     turn = jnp.asarray(np.arange(side) * golden, jnp.float32)
     rise = jnp.asarray((2 * np.arange(side) + 1) / side - 1, jnp.float32)
     round_ = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0 * turn], -1)
-    disc = np.sqrt((np.arange(end) + 0.5) / end)[:, None] * np.stack(
-        [np.cos(np.arange(end) * golden), np.sin(np.arange(end) * golden)], -1
-    )
-    disc = jnp.asarray(np.concatenate([disc, np.zeros((end, 1))], 1), jnp.float32)
-    up = jnp.array([[0.0, 0.0, 1.0]])
-    position = [
-        size[0] * round_ + (size[1] * rise)[:, None] * up,
-        size[0] * disc + size[1] * up,
-        size[0] * disc - size[1] * up,
-    ]
-    return jnp.concatenate(position), jnp.concatenate([round_, jnp.tile(up, (end, 1)), jnp.tile(-up, (end, 1))])
+    angle = np.arange(end) * golden
+    disc = np.sqrt((np.arange(end) + 0.5) / end)[:, None] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    disc, up = jnp.asarray(disc, jnp.float32), jnp.array([[0.0, 0.0, 1.0]])
+    side_points = size[0] * round_ + (size[1] * rise)[:, None] * up
+    position = jnp.concatenate([side_points, size[0] * disc + size[1] * up, size[0] * disc - size[1] * up])
+    return position, jnp.concatenate([round_, jnp.tile(up, (end, 1)), jnp.tile(-up, (end, 1))])
 
 
 def _box_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:

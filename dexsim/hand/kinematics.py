@@ -1,11 +1,7 @@
-"""The hand as a static description, and its kinematics in pure JAX.
-
-`forward_kinematics` is the one kinematics that simulation and hardware share. `dexsim.hand.load.load_hand`
-reads a `Hand` from files.
+"""The hand as a static description, and the one kinematics in pure JAX that simulation and hardware share.
 
 Shapes: J joints that have motors, H hinges (more than J where one motor moves two), B bodies, F fingers, N taxels a
-finger. Frames: poses are in the palm frame
-(fingers +z, palm normal +x, thumb side +y).
+finger. Poses are in the palm frame (fingers +z, palm normal +x, thumb side +y).
 """
 
 import dataclasses
@@ -101,11 +97,8 @@ class HandPose:
 
 
 def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
-    """Poses of every link from joint angles [J] rad.
-
-    Bodies of equal depth in the tree move together, so the unrolled program has a few wide
-    operations instead of many small ones.
-    """
+    """Poses of every link from joint angles [J] rad; bodies of equal depth in the tree together, in a few wide
+    operations."""
     moving = hand.body_joint >= 0
     angle = jnp.where(moving, joint_position[np.maximum(hand.body_joint, 0)], 0.0)
     if hand.num_hinges > hand.num_joints:

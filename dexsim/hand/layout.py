@@ -5,8 +5,8 @@
     check_outside(patch, geometry)                                       # no taxel inside the link
     write_layout("taxels.csv", {"index": patch, "thumb": other})
 
-The file is the one that a hand's TOML names as `taxels` (`hand.load_hand`); `finger` in it stands for the link that
-carries the taxels. Taxel index = column * rows + row. Shapes: N taxels. Units: m, m^2.
+The file is the one that a hand's TOML names as `taxels`; `finger` in it is the link that carries the taxels.
+Taxel index = column * rows + row. Shapes: N taxels. Units: m, m^2.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ import numpy as np
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import write_whole
+from dexsim.geometry import sdf
+from dexsim.geometry.distance import signed_distance
 
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
@@ -55,7 +57,6 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
     """A lattice centred on zero.
 
     Args:
-      columns, rows: how many.
       pitch: distance of neighbours; for "rect" also (across, along).
       kind: "rect", or "hex" with every other row shifted by half a pitch and rows sqrt(3)/2 pitches apart.
 
@@ -140,24 +141,13 @@ def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> 
 
 
 def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
-    """Require that no taxel is deeper than `tolerance` inside the link it sits on.
-
-    Args:
-      geometry: the link's surface in its frame, such as `grid.bake` gives.
+    """Require that no taxel is deeper than `tolerance` m inside its link, whose surface `grid.bake` gives for example.
 
     Raises:
-      AssetError: one does; names it and its depth.
+      AssetError: names the deepest one.
     """
-    from dexsim.geometry.distance import signed_distance
-
     distance = np.asarray(signed_distance(np.asarray(patch.position, np.float32), geometry))
-    worst = int(distance.argmin())
-    if distance[worst] < -tolerance:
-        column, row = divmod(worst, patch.grid[1])
-        raise AssetError(
-            f"{name}: taxel column {column}, row {row} lies {-1e3 * distance[worst]:.2g} mm inside "
-            f"its link ({np.sum(distance < -tolerance)} of {len(distance)} do)"
-        )
+    _refuse(name, patch, distance < -tolerance, -distance, f"lies {-1e3 * distance.min():.2g} mm inside its link")
 
 
 def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
@@ -168,9 +158,6 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
     Raises:
       AssetError: a taxel is inside its link (`check_outside`), away from it, or faces inwards.
     """
-    from dexsim.geometry import sdf
-    from dexsim.geometry.distance import signed_distance
-
     for finger, name in enumerate(hand.finger_names):
         geometry = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
         if geometry is None:
@@ -181,15 +168,17 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
             np.asarray(signed_distance(np.asarray(patch.position + step * patch.normal, np.float32), geometry))
             for step in (0.0, _STEP)
         )
-        for what, wrong in (
-            (f"is {1e3 * distance.max():.3g} mm away from its link: metres, in the link's frame?", distance > _AWAY),
-            ("faces into its link: is the normal outward?", ahead <= distance),
-        ):
-            if wrong.any():
-                column, row = divmod(int(np.argmax(np.where(wrong, distance, -np.inf))), patch.grid[1])
-                raise AssetError(
-                    f"finger {name!r}: taxel column {column}, row {row} {what} ({wrong.sum()} of {len(wrong)} are so)"
-                )
+        away = f"is {1e3 * distance.max():.3g} mm away from its link: metres, in the link's frame?"
+        _refuse(f"finger {name!r}", patch, distance > _AWAY, distance, away)
+        inward = "faces into its link: is the normal outward?"
+        _refuse(f"finger {name!r}", patch, ahead <= distance, distance, inward)
+
+
+def _refuse(name: str, patch: Patch, wrong: np.ndarray, size: np.ndarray, what: str) -> None:
+    """Raise the error of the taxel that is `wrong` [N] with the largest `size` [N], if any is."""
+    if wrong.any():
+        column, row = divmod(int(np.argmax(np.where(wrong, size, -np.inf))), patch.grid[1])
+        raise AssetError(f"{name}: taxel column {column}, row {row} {what} ({wrong.sum()} of {len(wrong)})")
 
 
 def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
@@ -256,10 +245,8 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does.
-
-    Moeller and Trumbore 1997.
-    """
+    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does
+    (Moeller and Trumbore 1997)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     ab, ac = b - a, c - a
     across = np.cross(ray, ac)

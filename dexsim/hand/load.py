@@ -1,8 +1,5 @@
-"""The hand, read from files; its description and kinematics are those of `dexsim.hand.kinematics`.
-
-`load_hand` reads an MJCF, a taxel layout and a short TOML, so nothing in the library but the
-files under `assets/hand/` knows which hand it is.
-"""
+"""The hand, read from an MJCF, a taxel layout and a short TOML: nothing in the library but the files under
+`assets/hand/` knows which hand it is."""
 
 import dataclasses
 from pathlib import Path
@@ -13,12 +10,11 @@ import numpy as np
 from dexsim.core.config import Config, from_dict, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
-from dexsim.hand.coupling import read_followers
 from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
 from dexsim.hand.layout import MOST, lattice, on_surface, placed, read_taxels
 
-_SLACK = 1e-3  # rad, how far a posture may be beyond a joint's range
+_SLACK = 1e-3  # rad, how far a posture or a follower may be beyond a joint's range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -172,10 +168,9 @@ def _load_model(path: Path, model_path: Path) -> Any:
     if not model_path.is_file():
         raise AssetError(f"{model_path}: no such file (model of {path})")
     try:
-        model = mujoco.MjModel.from_xml_path(str(model_path))
+        return mujoco.MjModel.from_xml_path(str(model_path))
     except ValueError as error:
         raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
-    return model
 
 
 def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int:
@@ -191,11 +186,11 @@ def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int
 def _find_joints(
     path: Path, model_path: Path, model: Any, table: HandFile
 ) -> tuple[list[int], dict[int, tuple[int, float, float]]]:
-    """The model's joints in the order of the TOML, and those that follow them (`read_followers`)."""
+    """The model's joints in the order of the TOML, and those that follow them."""
     import mujoco
 
     joints = [_find(path, model_path, model, "joint", name) for name in table.joints]
-    followers = read_followers(model_path, model, joints)
+    followers = _read_followers(model_path, model, joints)
     motors = model.njnt - len(followers)
     hinges = np.all(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     if len(joints) != motors or len(set(joints)) != motors or not hinges:
@@ -212,6 +207,42 @@ def _find_joints(
                 f"got {low:g} to {high:g} Nm"
             )
     return joints, followers
+
+
+def _read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple[int, float, float]]:
+    """Hinges that follow a motor (one motor, two joints): for each its motor's joint, the ratio and the offset [rad].
+
+    The MJCF says so by an `<equality>` of joints, which the physics honours too. MuJoCo's polynomial is
+    q1 - ref1 = a0 + a1 (q2 - ref2) + ...
+    """
+    import mujoco
+
+    if model.ntendon:
+        raise AssetError(f"{path}: tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
+    followers: dict[int, tuple[int, float, float]] = {}
+    for index in range(model.neq):
+        first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
+        what = f"{path}: equality {model.equality(index).name or f'#{index}'!r}"
+        if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[index]:
+            raise AssetError(f"{what}: only active ones of two joints are supported")
+        a0, ratio, *higher = model.eq_data[index, :5]
+        if any(higher) or not ratio:
+            raise AssetError(f"{what}: polycoef {model.eq_data[index, :5].tolist()} is not of the form a0 a1 0 0 0")
+        names = [model.joint(joint).name for joint in (first, second)]
+        if first in motors or first in followers:
+            raise AssetError(f"{what}: joint {names[0]!r} has a motor or follows another joint already")
+        if second not in motors:
+            raise AssetError(f"{what}: joint {names[0]!r} follows {names[1]!r}, which has no motor (see joints)")
+        reference = model.qpos0[model.jnt_qposadr[[first, second]]]
+        followers[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
+        reach = np.sort(followers[first][1] * model.jnt_range[second] + followers[first][2])
+        low, high = model.jnt_range[first]
+        if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
+            raise AssetError(
+                f"{path}: joint {names[0]!r} has the range {low:.4g} to {high:.4g} rad, and {names[1]!r} takes it from "
+                f"{reach[0]:.4g} to {reach[1]:.4g}"
+            )
+    return followers
 
 
 def _hinges_of_bodies(model_path: Path, model: Any, palm: int, row: dict[int, int]) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Which files a hand was read from, so that what was trained on it is used on the same hand.
+"""Provenance of a hand, so that what was trained on it is used on the same hand.
 
 A record is plain data: the TOML's name as it was given, a hash of the hand's files, and what its arrays count. None
-stands for the shipped default hand, of which policies have no record.
+stands for the shipped default hand.
 """
 
 import warnings
@@ -29,7 +29,8 @@ def check_same(record: Record | None, hand: Hand, what: str) -> None:
     """
     now = record_of(hand)
     if (record and record["digest"]) != (now and now["digest"]):
-        raise ConfigError(f"{what} is of the hand {_name(record)}, not of {_name(now)}{_changed(record, now)}")
+        changed = ": its files have changed since" if record and now and record["file"] == now["file"] else ""
+        raise ConfigError(f"{what} is of the hand {_name(record)}, not of {_name(now)}{changed}")
 
 
 def recorded_hand(record: Record | None, given: str | Path | None, what: str) -> Hand | None:
@@ -84,8 +85,3 @@ def record_as_of(hand: Hand) -> Record:
 
 def _name(record: Record | None) -> str:
     return f"{str(record['file'])[:200]!r}" if record else f"{DEFAULT!r}"
-
-
-def _changed(record: Record | None, now: Record | None) -> str:
-    same = record and now and record["file"] == now["file"]
-    return ": its files have changed since" if same else ""

@@ -1,8 +1,7 @@
-"""Joint targets that make an actuator show its parameters, safe for the hand.
+"""Joint targets that make an actuator show its parameters, within the joint limits; NumPy, made before a recording.
 
-Chirps show inertia, damping and delay; steps the torque-speed envelope; slow triangles friction;
-small reversals backlash. `excitation` strings them together for one joint after the other, within
-the joint limits. Everything is NumPy, made once, before a recording.
+Chirps show inertia, damping and delay; steps the torque-speed envelope; slow triangles friction; small reversals
+backlash.
 """
 
 import dataclasses
@@ -79,34 +78,24 @@ def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndar
     for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
         wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
         bursts += [size * strength * wave, np.zeros(round(_PAUSE / period))]
-    parts = [
-        rest,
-        *bursts,
-        rest,
+    signals = [
+        np.concatenate(bursts),
         size * steps(config.step_count, _STEP, period),
-        rest,
         size * triangles(1, 4 * size / _SLOW, period),
-        rest,
         small * triangles(config.reversal_cycles, _REVERSAL_TIME, period),
-        rest,
     ]
-    return middle + np.concatenate(parts)
+    return middle + np.concatenate([rest, *(part for signal in signals for part in (signal, rest))])
 
 
 def excitation(
     hand: Hand, config: Excitation, posture: np.ndarray | None = None, joints: tuple[str, ...] | None = None
 ) -> dict[str, np.ndarray]:
-    """Targets of the whole hand while one joint after the other is moved.
+    """Targets [T, J] rad, every `config.period`, by the name of the joint that moves while the others rest.
 
     Args:
-      hand: names and limits.
-      config: the signals.
-      posture: [J] rad, where joints rest and about which they move; the middle of their ranges by
-        default. An open hand keeps fingers from touching each other.
+      posture: [J] rad, where joints rest and about which they move; the middle of their ranges by default. An open hand
+        keeps fingers from touching each other.
       joints: which to move; all by default.
-
-    Returns:
-      By the name of the moving joint, targets [T, J] rad, every `config.period`.
 
     Raises:
       ConfigError: an unknown joint, or a posture too close to a limit to move.

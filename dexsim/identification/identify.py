@@ -1,9 +1,7 @@
 """System identification: actuator parameters from commanded and measured joint positions.
 
-Output error: the joint is simulated from the commands alone (`dexsim.identification.joint`), and the
-parameters are moved until its readings are the log's. Smooth parameters go by the gradient through
-the jitted simulation; latency is a whole number and the dead-band a threshold, so they are
-searched outside of it (`dexsim.identification.search`).
+Output error: the joint is simulated from the commands alone (`dexsim.identification.joint`), and the parameters are
+moved until its readings are the log's (`dexsim.identification.search`).
 """
 
 import dataclasses
@@ -11,11 +9,12 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 from dexsim.core.errors import CalibrationError
+from dexsim.core.robust_line import LEAST_GROUPS, long_run
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 from dexsim.identification.search import CHI2, Search
-from dexsim.identification.uncertainty import groups, uncertainty
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -27,6 +26,9 @@ MODEL = (
 )
 """Note of every identification."""
 
+_NULL = 1e-4  # singular values below this share of the largest are none: the Jacobian is float32
+_CORRELATED, _VAGUE = 0.97, 0.5
+_NORMAL = 1.96  # 97.5 % quantile
 _GROUP = "the data do not separate or do not show {}: docs/calibration.md says what to record"
 
 FIT = ("stiffness", "damping", "coulomb_friction", "viscous_friction", "stall_torque")
@@ -42,23 +44,18 @@ class Identification:
     """Every parameter of the model, fitted or fixed."""
     fitted: tuple[str, ...]
     intervals: dict[str, tuple[float, float]]
-    """95 %, of the fitted ones; infinite where the data do not tell. For a joint that obeys this model at this time
-    step: noise and what differs from signal to signal are in it, another engine's steps are not."""
+    """95 %, of the fitted ones; infinite where the data do not tell. Noise and what differs from signal to signal are
+    in it, another engine's steps are not."""
     correlation: np.ndarray
     """[P, P], in the order of `fitted`; NaN for what the data do not tell."""
-    condition: float
-    """Condition number of the Jacobian, each column for a relative change of its parameter."""
     latency: int
     """Sub-steps."""
-    latency_cost: dict[int, float]
-    """Sum of squares over that of the best, less one, at each latency tried."""
     latency_plausible: tuple[int, ...]
     """Latencies that the data do not exclude."""
     timestep: float
     """s, of a sub-step."""
     unidentifiable: tuple[tuple[str, ...], ...]
-    """Groups of which only a combination is known; alone: no effect on these data, or next to
-    none."""
+    """Groups of which only a combination is known; alone: next to no effect on these data."""
     at_bound: tuple[str, ...]
     rmse: float
     """rad, of the angles fitted to."""
@@ -72,9 +69,9 @@ class Identification:
 
     def report(self) -> str:
         """A table for people."""
+        rmse, after, before = (1e3 * error for error in (self.rmse, self.holdout_rmse, self.holdout_rmse_before))
         rows = [
-            f"{self.joint}: rmse {1e3 * self.rmse:.2f} mrad, hold-out "
-            f"{1e3 * self.holdout_rmse:.2f} mrad (before {1e3 * self.holdout_rmse_before:.2f})",
+            f"{self.joint}: rmse {rmse:.2f} mrad, hold-out {after:.2f} mrad (before {before:.2f})",
             f"{'parameter':18}{'value':>12}{'95 % from':>12}{'to':>12}  unit",
         ]
         for name in self.fitted:
@@ -82,10 +79,8 @@ class Identification:
             mark = " at its bound" if name in self.at_bound else ""
             rows.append(f"{name:18}{self.values[name]:12.5g}{low:12.5g}{high:12.5g}  {PARAMETERS[name].unit}{mark}")
         others = ", ".join(str(lag) for lag in self.latency_plausible if lag != self.latency)
-        rows.append(
-            f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms"
-            + (f" (not excluded: {others})" if others else "")
-        )
+        mark = f" (not excluded: {others})" if others else ""
+        rows.append(f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms{mark}")
         return "\n".join(rows + [f"note: {note}" for note in self.notes])
 
 
@@ -121,11 +116,9 @@ def identify(
     latency, theta, count = search.latency, search.theta, search.count
     fitted = search.names[:count]
     residual = search.residual(theta, search.starts)
-    intervals, correlation, condition, unidentifiable = _intervals(search, residual)
-    values = {name: float(value) for name, value in search.fixed.items()}
-    first = dict(values)
-    values |= dict(zip(search.names, map(float, theta), strict=True))
-    values["start"] = float(search.starts[0])
+    intervals, correlation, unidentifiable = _intervals(search, residual)
+    first = {name: float(value) for name, value in search.fixed.items()}
+    values = first | dict(zip(search.names, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
     margin = 1e-3 * _size(search)
     at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
     at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
@@ -133,9 +126,8 @@ def identify(
     cost = {}
     for search.latency in sorted(latencies):
         cost[search.latency] = search.solve(theta, 10)[0]
-    least = min(cost.values())
-    slack = CHI2 / max(residual.size - count, 1)
-    plausible = tuple(lag for lag in cost if cost[lag] <= least * (1 + slack))
+    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
+    plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")
     if holdout is not None:
         before, _ = evaluate(holdout, first, latency=latency, substeps=substeps)
@@ -150,9 +142,7 @@ def identify(
         fitted=fitted,
         intervals=intervals,
         correlation=correlation,
-        condition=condition,
         latency=latency,
-        latency_cost={lag: cost[lag] / least - 1.0 for lag in cost},
         latency_plausible=plausible,
         timestep=search.timestep,
         unidentifiable=unidentifiable,
@@ -172,8 +162,8 @@ def _size(search: Search) -> np.ndarray:
 
 def _intervals(
     search: Search, residual: np.ndarray
-) -> tuple[dict[str, tuple[float, float]], np.ndarray, float, tuple[tuple[str, ...], ...]]:
-    """Intervals and correlation [P, P] of the fitted parameters, condition number, and groups that are not separated.
+) -> tuple[dict[str, tuple[float, float]], np.ndarray, tuple[tuple[str, ...], ...]]:
+    """Intervals and correlation [P, P] of the fitted parameters, and groups that are not separated.
 
     From the curvature at the best point, widened by what was seen to fit as well farther off.
     """
@@ -181,7 +171,7 @@ def _intervals(
     jacobian = search.jacobian(search.theta, search.starts)
     columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
     sizes = np.append(size, np.full(len(search.starts), 0.05))
-    half, correlation, condition, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
+    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     least, largest = search.plausible()
@@ -192,7 +182,77 @@ def _intervals(
         low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
     fitted = search.names[:count]
     intervals = {name: (float(a), float(b)) for name, a, b in zip(fitted, low, high, strict=True)}
-    return intervals, correlation, condition, groups(fitted, null, correlation, half, size)
+    return intervals, correlation, _groups(fitted, null, correlation, half, size)
+
+
+def uncertainty(
+    jacobian: np.ndarray, residual: np.ndarray, size: np.ndarray, segment: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Half-widths and correlations from a least-squares solution.
+
+    Args:
+      jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
+      size: [P], what counts as a relative change of 1.
+      segment: [T] int, parts of the log that began at rest; residuals of one part belong together.
+
+    Returns:
+      Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
+      directions [P] as boolean masks of their members.
+    """
+    relative = jacobian * size
+    _, singular, right = np.linalg.svd(relative, full_matrices=False)
+    determined = singular > _NULL * singular[0]
+    null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
+    inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
+    freedom = max(len(residual) - len(size), 1)
+    white = inverse * np.sum(residual**2) / freedom
+    score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)
+    robust = inverse @ long_run(score) @ inverse * len(residual) / freedom
+    # Whichever is larger: the robust one is itself a guess and falls short in half of all cases.
+    half = _NORMAL * np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
+    half = np.maximum(half, _between_segments(relative, score, segment)) * size
+    spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
+    correlation = white / np.outer(spread, spread)
+    for members in null:
+        half[members] = np.inf
+        correlation[members], correlation[:, members] = np.nan, np.nan
+    return half, correlation, null
+
+
+def _between_segments(relative: np.ndarray, score: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """Half of the 95 % intervals [P] by the jackknife over segments, one Newton step each.
+
+    What the model gets wrong differs from signal to signal, which no autocorrelation shows.
+    """
+    rows = relative.reshape(-1, len(segment), relative.shape[1])
+    parts = [np.einsum("ctp,ctq->pq", rows[:, segment == k], rows[:, segment == k]) for k in np.unique(segment)]
+    count, whole = len(parts), np.sum(parts, 0)
+    if count < LEAST_GROUPS:
+        return np.zeros(len(whole))
+    scores = [score[segment == k].sum(0) for k in np.unique(segment)]
+    moved = [
+        np.linalg.pinv(whole - part, rcond=_NULL**2, hermitian=True) @ own
+        for part, own in zip(parts, scores, strict=True)
+    ]
+    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
+
+
+def _groups(
+    names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray, half: np.ndarray, size: np.ndarray
+) -> tuple[tuple[str, ...], ...]:
+    """Which parameters the data do not separate, or do not see."""
+    sets = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
+    inside = {name for group in sets for name in group}
+    for i, first in enumerate(names):
+        if first in inside:
+            continue
+        mates = [j for j in range(len(names)) if j != i and abs(correlation[i, j]) > _CORRELATED]
+        vague = half[i] > _NORMAL * _VAGUE * size[i]
+        if vague and mates:
+            sets.append(tuple(sorted({first, *(names[j] for j in mates)}, key=names.index)))
+        elif vague:
+            sets.append((first,))
+    return tuple(dict.fromkeys(sets))
 
 
 def _notes(

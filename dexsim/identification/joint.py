@@ -2,10 +2,9 @@
 
     I qdd = friction(drive(target delayed, q, qd)) - g_cos cos(q) - g_sin sin(q)
 
-The joint alone: its inertia about the axis is constant (the diagonal of the hand's mass matrix,
-rotor included), the other joints stand still, nothing touches, gravity goes with the angle.
-Integrated as the physics does, semi-implicit Euler at the physics' time step, with the same
-`dexsim.actuator.drive` code, so that what is fitted here means the same there.
+The joint alone: its inertia about the axis is constant (the diagonal of the hand's mass matrix, rotor included), the
+other joints stand still, nothing touches, gravity goes with the angle. Integrated as the physics does, semi-implicit
+Euler at the physics' time step with the same drive, so that what is fitted here means the same there.
 """
 
 import dataclasses
@@ -72,21 +71,15 @@ def simulate(
     segment: jax.Array | None = None,
     blur: float = 0.0,
 ) -> tuple[jax.Array, jax.Array]:
-    """Readings of the joint at each command.
+    """Measured angle [T] rad (encoder bias included) and motor torque [T] Nm at each command, before noise.
 
     Args:
-      values: every name in `PARAMETERS`, scalars, and `start`, which may be [T], that of each
-        sample's segment.
+      values: every name in `PARAMETERS`, scalars, and `start`, which may be [T], that of each sample's segment.
       target: [T] rad, a new one every `substeps` sub-steps; at rest before the first.
       latency: [] int, sub-steps until a target acts.
       timestep: s, of a sub-step.
-      substeps: sub-steps between samples.
-      segment: [T] int, which segment a sample belongs to: at the first of each the joint is put
-        to its `start` and to rest. None is one segment.
+      segment: [T] int; at the first sample of each segment the joint is put to its `start` and to rest. None: one.
       blur: rad, width of the dead-band's edges, for a gradient that sees it; 0 is the true model.
-
-    Returns:
-      Measured angle [T] rad (encoder bias included) and motor torque [T] Nm, before noise.
     """
     drive = Actuator(**{name: values[name] for name in PARAMETERS if name not in _JOINT})
     count = target.shape[0]
@@ -133,12 +126,11 @@ def _blurred_torque(
 
 
 def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarray, np.ndarray]:
-    """Where a log may be begun anew because the joint rests: segment [T] int32, angle [S] rad.
+    """Where a log may be begun anew because the joint rests: segment [T] int32, and its resting angle [S] rad.
 
-    A joint in a dead-band or held by friction remembers where it came to rest; a simulation that
-    misses that place by a little goes astray from there on. So each time the target has stood
-    still for `before` samples, and the joint too, a segment of at least `least` samples begins.
-    The angle is the mean of the resting samples, encoder bias included.
+    A joint in a dead-band or held by friction remembers where it came to rest; a simulation that misses that place by a
+    little goes astray from there on. So each time the target has stood still for `before` samples, and the joint too, a
+    segment of at least `least` samples begins.
     """
     position = np.asarray(log.position, float)
     noise = 1.4826 * np.median(np.abs(np.diff(position, 2))) / np.sqrt(6) + 1e-5

@@ -1,7 +1,8 @@
-"""The search of an identification: one log's least squares, inner and outer loops.
+"""The search of an identification: one log's least squares.
 
 Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops without
-gradient: scans over latency and dead-band, and a cross-entropy search, as a dead-band makes the cost rugged.
+gradient: scans over latency (a whole number) and dead-band (a threshold), and a cross-entropy search, as a dead-band
+makes the cost rugged.
 """
 
 import functools
@@ -22,8 +23,7 @@ CHI2 = 3.84  # 95 %, one parameter
 _THRESHOLD = 7.35  # 95 % for a threshold (Hansen 2000): the likelihood has a kink there
 _NOISE = (0.002, 0.02)  # rad, Nm: weights of angle and torque to begin with
 
-# All parameters of the model but the starts, in the order of the arrays below: whatever is fitted,
-# the compiled programs are the same.
+# In the order of the arrays below: whatever is fitted, the compiled programs are the same.
 _NAMES = tuple(PARAMETERS)
 
 
@@ -75,12 +75,7 @@ def _crowd_costs(data: _Data, crowd: jax.Array, starts: jax.Array, latency: jax.
 class Search:
     """One log's least squares: theta [P] (what is fitted, the dead-band last), the starts [S], and the latency.
 
-    Args:
-      log: checked.
-      start: first guesses and fixed values.
-      fit: names in `PARAMETERS`, not the dead-band.
-      substeps: in a sample.
-      dead_band: range to search, rad; None keeps the value in `start`.
+    The arguments are those of `identify`, the log is checked.
 
     Raises:
       CalibrationError: a name that cannot be fitted, or a first guess out of its bounds.
@@ -106,8 +101,7 @@ class Search:
         """Parameters that are fitted in the end."""
         parameters = [PARAMETERS[name] for name in self.names]
         self.low, self.high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
-        if dead_band is not None:
-            self.low[-1], self.high[-1] = dead_band
+        self.low[-1], self.high[-1] = dead_band or (self.low[-1], self.high[-1])
         self.typical = np.array([p.typical for p in parameters])
         begin = np.array([float(self.fixed[name]) for name in self.names])
         for name, value, low, high in zip(self.names, begin, self.low, self.high, strict=True):
@@ -192,18 +186,15 @@ class Search:
             self.best, self.theta, self.starts = cost, theta, starts
         return cost
 
-    def _call(self, function: Callable[..., jax.Array], theta: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        out = function(self._data, self._all(theta), self._by_sample(starts), jnp.int32(self.latency))
-        return np.nan_to_num(np.asarray(out, float), nan=1e3, posinf=1e3, neginf=-1e3)
-
-    def _all(self, theta: np.ndarray) -> jax.Array:
-        """All parameters [..., len(_NAMES)] from the fitted ones [..., P]."""
+    def _call(
+        self, function: Callable[..., jax.Array], theta: np.ndarray, starts: np.ndarray, *more: Any, far: float = 1e3
+    ) -> np.ndarray:
+        """`function` of the log, of all parameters [..., len(_NAMES)] from the fitted ones [..., P], and the starts."""
         values = np.broadcast_to(self._values, (*theta.shape[:-1], len(_NAMES))).copy()
         values[..., self._index] = theta
-        return jnp.asarray(values, jnp.float32)
-
-    def _by_sample(self, starts: np.ndarray) -> jax.Array:
-        return jnp.asarray(starts[self.segment], jnp.float32)
+        by_sample = jnp.asarray(starts[self.segment], jnp.float32)
+        out = function(self._data, jnp.asarray(values, jnp.float32), by_sample, jnp.int32(self.latency), *more)
+        return np.nan_to_num(np.asarray(out, float), nan=far, posinf=far, neginf=-far)
 
     # --- the outer loops --------------------------------------------------------------------------
 
@@ -248,8 +239,8 @@ class Search:
             self._explore(rounds=14 if with_band else 3)
 
     def _start_over(self, tries: int) -> None:
-        """Solve again from about the present parameters, and from the angles as they were read:
-        a valley to which parameters and starts have settled together has no other way out."""
+        """Solve again from about the present parameters and from the angles as they were read: a valley to which both
+        have settled together has no other way out."""
         rng, best, starts = np.random.default_rng(1), self.theta, self.starts
         for index in range(tries):
             width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
@@ -268,7 +259,7 @@ class Search:
         slope = self.jacobian(self.theta, self.starts)[:, :count] * scale
         middle = self.theta[:count] / scale
         spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
-        rng = np.random.default_rng(0)
+        rng, weight = np.random.default_rng(0), 1.0 / jnp.asarray(self.noise, jnp.float32)
         self._seen = []
         for _ in range(rounds):
             tries = rng.multivariate_normal(middle, spread, crowd)
@@ -276,7 +267,7 @@ class Search:
             tries[0] = middle
             thetas = np.tile(self.theta, (crowd, 1))
             thetas[:, :count] = tries * scale
-            costs = self._costs(thetas)
+            costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)
             order = np.argsort(costs)
             self._seen.append((thetas, costs))
             elite = tries[order[: crowd // 8]]
@@ -285,12 +276,6 @@ class Search:
             self._attempt(thetas[order[0]], 6, self.dead_band is not None)
             if self.best < before:
                 middle = self.theta[:count] / scale
-
-    def _costs(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squares [N] of many candidates at once."""
-        arguments: tuple[Any, ...] = (self._by_sample(self.starts), jnp.int32(self.latency))
-        out = _crowd_costs(self._data, self._all(thetas), *arguments, 1.0 / jnp.asarray(self.noise, jnp.float32))
-        return np.nan_to_num(np.asarray(out, float), nan=np.inf)
 
     # --- what fits as well ------------------------------------------------------------------------
 

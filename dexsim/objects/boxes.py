@@ -1,11 +1,9 @@
 """A union of boxes that follows a mesh: what the solver collides with where the object is a mesh.
 
-Both physics backends take a mesh for its convex hull, at one size for all environments, and at a cost that
-grows with its faces. Boxes may be sized anew in every episode, follow hollows, and are the same on both.
-
-Boxes are grown one after another inside the voxels of the mesh, each where it covers most that is not
-covered yet, and then moved, turned and sized together so that the distance to their union is the distance
-to the mesh near its surface.
+Physics engines take a mesh for its convex hull, at one size for all environments, and at a cost that grows with its
+faces. Boxes may be sized anew in every episode, follow hollows, and are the same everywhere. They are grown one after
+another inside the voxels of the mesh, each where it covers most that is not covered yet, and then moved, turned and
+sized together so that the distance to their union is the distance to the mesh near its surface.
 """
 
 from __future__ import annotations

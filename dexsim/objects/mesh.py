@@ -35,12 +35,7 @@ class MeshObject:
 
 
 def load(path: str, *, unit: float, parts: int) -> MeshObject:
-    """The object of a mesh file; fitted once and kept on disk.
-
-    Args:
-      path: any format that trimesh reads.
-      unit: m, length of the file's unit.
-      parts: boxes at most.
+    """The object of a mesh file, in any format that trimesh reads, with `parts` boxes at most; `unit` is the file's, m.
 
     Raises:
       AssetError: no such file, not closed, or not to be followed by so many boxes.

@@ -1,11 +1,8 @@
 """What is grasped: unions of a few primitives whose sizes are drawn at every episode start.
 
-One compiled model has a fixed slot for each kind of primitive that the shapes asked for need. An object switches
-slots on and sizes them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
-touch read the same sizes.
-
-A sphere is the capsule slot with next to no length: a slot less to collide. A mesh takes the place of
-all that (`ObjectConfig.mesh`): its slots are the boxes that follow it.
+One compiled model has a fixed slot for each kind of primitive that the shapes asked for need. An object switches slots
+on and sizes them, so spheres, boxes, cylinders, capsules and compositions share one batch; collision and touch read the
+same sizes. A sphere is the capsule slot with next to no length. The slots of a mesh are the boxes that follow it.
 """
 
 import dataclasses
@@ -48,10 +45,7 @@ def extent(
     kinds: tuple[str, ...] = SLOTS,
     quat: jax.Array | None = None,
 ) -> jax.Array:
-    """How far [] m the object reaches along a unit `direction` [3] of its own frame.
-
-    The other arguments are those of `ObjectParams`.
-    """
+    """How far [] m the object of these `ObjectParams` reaches along a unit `direction` [3] of its own frame."""
     reaches = []
     for k, kind in enumerate(kinds):
         local = direction if quat is None else rotations.rotate_inverse(rotations.quat_to_matrix(quat[k]), direction)
@@ -136,12 +130,9 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
 def redraw_bulk(
     key: jax.Array, object: ObjectParams, config: ObjectConfig, plain: jax.Array, names: tuple[str, ...]
 ) -> ObjectParams:
-    """The same object with another bulk. Its shape stays: start states were chosen for it.
+    """The same object with another bulk; an extreme object stays one. Its shape stays: start states were chosen for it.
 
     Args:
-      key: of the bulk.
-      object: one of `config`; an extreme object stays one, at ends of its own for every value.
-      config: the ranges.
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       names: the ranges, of `BULK_RANGES`, that are drawn.
     """
@@ -202,17 +193,12 @@ def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> ja
 def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
     """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
 
-    Its size stays: start states were chosen for it.
-
     Args:
-      config: the ranges that it was drawn from.
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
     config, bulk = config.narrowed(), _bulk_of(object, plain)
-    middle: dict[str, Any] = {name: nominal(config, name) for name in bulk if name != "com_offset"} | {
-        "com_offset": 0.0
-    }
+    middle: dict[str, Any] = {name: 0.0 if name == "com_offset" else nominal(config, name) for name in bulk}
     middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
     near = {name: middle[name] + scale * (value - middle[name]) for name, value in bulk.items()}
     return _with_bulk(object, plain, near)
@@ -221,9 +207,8 @@ def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array,
 def restitution(ratio: np.ndarray) -> np.ndarray:
     """Coefficient of restitution of a spring-damper that pushes but does not pull.
 
-    e = exp(-2 z / sqrt(1 - z^2) atan(sqrt(1 - z^2) / z)), with the hyperbolic functions above 1:
-    contact ends when the force does, before the spring is back at its length (Schwager and
-    Poeschel, Granular Matter 9 (2007) 465).
+    e = exp(-2 z / sqrt(1 - z^2) atan(sqrt(1 - z^2) / z)), with the hyperbolic functions above 1: contact ends when the
+    force does, before the spring is back at its length (Schwager and Poeschel, Granular Matter 9 (2007) 465).
     """
     ratio = np.asarray(ratio, float)
     root = np.maximum(np.sqrt(np.abs(1 - ratio**2)), 1e-6)
@@ -239,13 +224,10 @@ _RESTITUTIONS = restitution(_RATIOS)
 
 
 def damping_ratio(restitution: jax.Array) -> jax.Array:
-    """Damping ratio [...] of a contact that bounces with this restitution [...], at most 3.
-
-    MuJoCo has no restitution parameter; its contacts push but do not pull.
-    """
-    return jnp.interp(
-        restitution, jnp.asarray(_RESTITUTIONS[::-1], jnp.float32), jnp.asarray(_RATIOS[::-1], jnp.float32)
-    )
+    """Damping ratio [...], at most 3, of a contact that bounces with this restitution [...]; MuJoCo has no such
+    parameter."""
+    restitutions, ratios = (jnp.asarray(row[::-1], jnp.float32) for row in (_RESTITUTIONS, _RATIOS))
+    return jnp.interp(restitution, restitutions, ratios)
 
 
 def _sample_slots(

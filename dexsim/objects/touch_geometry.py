@@ -17,10 +17,8 @@ TOUCH_METHODS = METHODS
 def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:
     """A pure function from one episode's object to its geometry, as `dexsim.geometry.distance` takes it.
 
-    Args:
-      config: the objects of the environment.
-      method: closed_form (the solver's primitives), grid (the mesh, baked) or surface_points (points on the mesh, or
-        on the primitives at their drawn sizes).
+    The method is closed_form (the solver's primitives), grid (the mesh, baked) or surface_points (points on the mesh,
+    or on the primitives at their drawn sizes).
 
     Raises:
       AssetError: the mesh cannot be baked.

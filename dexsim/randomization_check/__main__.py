@@ -55,12 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 2 where a range has no effect."""
     from dexsim.registry import find_task, make
 
-    arguments = cli.parse(
-        CheckArguments,
-        sys.argv[1:] if argv is None else argv,
-        prog="python -m dexsim.randomization_check",
-        description="Show that every range of the randomisation has an effect.",
-    )
+    description = "Show that every range of the randomisation has an effect."
+    arguments = cli.parse(CheckArguments, argv, prog="python -m dexsim.randomization_check", description=description)
     entry = find_task(arguments.task)
     if entry.environment:
         raise ConfigError(f"--task {arguments.task}: is no task on a hand: it has no randomisation to check")

@@ -1,8 +1,4 @@
-"""What drawing a range changes: in the episode's draw or the compiled model, and then in motion and readings.
-
-Every range is drawn by itself, all others at their nominal values, and the same starts and actions are run with and
-without it.
-"""
+"""What drawing a range by itself changes: in the draw or the compiled model, and then in motion and readings."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -65,16 +61,8 @@ def range_paths(env: Env) -> list[str]:
 def check(
     env: Env, step: Callable, states: State, *, key: jax.Array, ticks: int = 12, names: Sequence[str] | None = None
 ) -> list[Effect]:
-    """Draw every range by itself and compare the motion.
-
-    Args:
-      env: the environment.
-      step: its compiled `step` over a batch.
-      states: a batch of fresh states.
-      key: of the draws and actions.
-      ticks: length of the comparison.
-      names: which ranges, of `range_paths`; by default all.
-    """
+    """Draw every range (or those of `names`) by itself and compare the motion over some ticks, with an environment's
+    compiled `step` over a batch of fresh states."""
     key, action_key = jax.random.split(key)
     # Fingers close, and all joints are thrown about: contact, full torque and speed occur.
     throw = jax.random.uniform(action_key, (ticks, len(states.tick), env.action_size), minval=-1.0)
@@ -108,7 +96,12 @@ def check(
         before, after = draw(path, config), draw(path, _with(config, path, span))
         base = run(before)
         size = {name: float(np.sqrt(np.mean(base[name] ** 2))) or 1.0 for name in READINGS}
-        moved = {name: float(np.max(values)) for name, values in _distance(run(after), base).items()}
+        track = run(after)
+        # Root mean square over hands and components, in the tick where it is largest.
+        moved = {
+            name: float(np.sqrt(np.mean((track[name] - base[name]) ** 2, tuple(range(1, base[name].ndim)))).max())
+            for name in base
+        }
         which = max(READINGS, key=lambda name: moved[name] / size[name])
         if path in env.task.object_ranges:  # What the physics is given must differ, not only what was drawn.
             models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], e.object)) for e in (before, after)]
@@ -129,11 +122,6 @@ def _run(env: Env, step: Callable, states: State, actions: jax.Array) -> dict[st
         motion = {"joint": qpos[:, env.physics.joint_qpos], "object": qpos[:, env.physics.object_qpos[:3]]}
         rows.append(motion | {name: np.asarray(getattr(states.readings, name), float) for name in READINGS})
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-
-
-def _distance(track: dict[str, np.ndarray], base: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Root mean square [T] over hands and components, by quantity."""
-    return {name: np.sqrt(np.mean((track[name] - base[name]) ** 2, tuple(range(1, base[name].ndim)))) for name in base}
 
 
 def changes(before: Any, after: Any) -> tuple[str, ...]:

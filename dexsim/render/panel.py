@@ -1,9 +1,7 @@
 """The read-out next to the picture: one unrolled taxel map per finger, forces in newton, command and colour scale.
 
-Drawn with Pillow and NumPy instead of matplotlib, which would cost more than the rest of a frame.
-
-A map shows the fingertip unrolled, seen from outside: column 0 at the left, row 0 (base of the fingertip) at the
-bottom and the last row (its tip) at the top; taxel index = column * rows + row.
+Drawn with Pillow and NumPy: matplotlib would cost more than the rest of a frame. A map shows the fingertip unrolled,
+seen from outside: column 0 at the left, row 0 (base of the fingertip) at the bottom; taxel index = column * rows + row.
 """
 
 from __future__ import annotations
@@ -45,10 +43,8 @@ def make_layout(width: int, height: int, grid: tuple[int, int], fingers: int) ->
     block_width, block_height = cell * columns, cell * rows + int(2.0 * font)
     left = (width - 2 * block_width) // 3
     top = (height - lines * block_height) // (lines + 1)
-    slots = tuple(
-        (left + (k % 2) * (block_width + left), top + (k // 2) * (block_height + top)) for k in range(2 * lines)
-    )
-    return Layout(width, height, cell, grid, slots[:fingers] + (slots[fingers],), font)
+    slots = [(left + (k % 2) * (block_width + left), top + (k // 2) * (block_height + top)) for k in range(fingers + 1)]
+    return Layout(width, height, cell, grid, tuple(slots), font)
 
 
 def taxel_image(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:

@@ -1,9 +1,8 @@
 """Pictures of posed primitives by ray casting in NumPy: no OpenGL, no display, the same picture on every machine.
 
-Every pixel's ray is intersected in closed form with each primitive inside that primitive's bounding box on the
-screen. The ray of pixel (x, y) in a primitive's own frame is affine in x and y, which makes a primitive a handful of
-array operations. Sizes follow MuJoCo: box half-extents; capsule and cylinder (radius, half_length, -) along z;
-sphere (radius, -, -); ellipsoid semi-axes.
+Every pixel's ray is intersected in closed form with each primitive inside that primitive's bounding box on the screen.
+In a primitive's own frame the ray of pixel (x, y) is affine in x and y, which makes a primitive a handful of array
+operations. Sizes are those of `dexsim.geometry.sdf`.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ class Camera:
 
 
 class CameraView(NamedTuple):
-    """A camera ready for a picture of one size: axes as rows (right, up, back), focal length in pixels."""
+    """A camera ready for a picture of one size."""
 
     origin: np.ndarray  # [3], m
-    axes: np.ndarray  # [3, 3]
+    axes: np.ndarray  # [3, 3], rows right, up, back
     scale: float  # pixels per unit slope
     size: tuple[int, int]  # width, height; the optical axis is in the middle
 
@@ -183,8 +182,8 @@ def _local_rays(
     return tuple(start), tuple((x * turn[0, k] - turn[2, k])[None, :] + (y * turn[1, k])[:, None] for k in range(3))
 
 
-# Each of these takes a ray o + t d in the primitive's frame and returns the first t. Where the ray misses they return
-# NaN (the root of a negative number), which compares as not nearer.
+# Each takes a ray o + t d in the primitive's frame and returns the first t; where the ray misses, NaN (the root of a
+# negative number), which compares as not nearer.
 
 
 def _ball(o, d, radius):

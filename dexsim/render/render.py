@@ -1,7 +1,6 @@
 """Frames, videos and taxel maps: the hand, the object and what 600 taxels feel, drawn without OpenGL.
 
-`render_frame` draws one `Snapshot`, `render_episode` a stack of them into an MP4 (or a GIF where no encoder is
-installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and matplotlib are imported when first used.
+Pillow and matplotlib are imported when first used.
 """
 
 import dataclasses
@@ -54,7 +53,7 @@ def render_frame(
       finger_range: force of a full bar [N]; the larger of the snapshot's target and largest finger force when left out.
 
     Raises:
-      ValueError: an unknown camera, a size without room for the scene, or kinds that do not match the snapshot.
+      ValueError: a size without room for the scene, or kinds that do not match the snapshot.
     """
     frame = _finite(snapshot)
     draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
@@ -74,8 +73,8 @@ def render_episode(
     """Write snapshots stacked along T, `fps` of them a second, as a video as long as they last; return its path.
 
     MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed; a path that ends in .gif
-    is always a GIF. The file appears whole or not at all. `rate` is the video's own number of frames a second, each the
-    nearest snapshot; None shows every snapshot. The camera is the preset named like the task.
+    is always a GIF. `rate` is the video's own number of frames a second, each the nearest snapshot; None shows every
+    snapshot. The camera is the preset named like the task.
 
     Raises:
       ValueError: no snapshots, or see `render_frame`.
@@ -106,12 +105,8 @@ def render_episode(
 
 
 def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):
-    """A matplotlib figure of the unrolled taxel maps: one per finger, tip at the top, one colour scale in N.
-
-    Args:
-      taxel_force: [F, N] N.
-      ax: a sequence of F axes to draw into; a new figure when left out.
-    """
+    """A matplotlib figure of the unrolled taxel maps of forces [F, N] N: one per finger, tip at the top, one colour
+    scale; on a new figure, or a sequence of F axes."""
     import matplotlib.pyplot as plt
 
     force = np.asarray(taxel_force)
@@ -136,8 +131,6 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
     """A function that draws frames of one size from one camera, with what stays the same computed once."""
     width, height = size
     panel_width = height // 2
-    if isinstance(camera, str) and camera not in CAMERAS:
-        raise ValueError(f"camera: no preset {camera!r}, the presets are {', '.join(CAMERAS)}")
     if width % 2 or height % 2 or width - panel_width < height // 4 or height < 120:
         raise ValueError(f"size: {width}x{height} must be even, at least 120 high and 0.75 times as wide as high")
     if np.shape(snapshot.primitive_size)[-2] != len(kinds):

@@ -1,7 +1,7 @@
 """A low-cost IMU inside the object: what its orientation reading does to the truth.
 
-White noise, a constant misalignment, a slow heading drift (no magnetometer), a sampling rate and a
-delay. Defaults are of the order that makers of fused 6-axis parts state.
+White noise, a constant misalignment, a slow heading drift (no magnetometer), a sampling rate and a delay. Defaults are
+of the order that makers of fused 6-axis parts state.
 """
 
 import dataclasses

@@ -146,15 +146,7 @@ class TaxelArray:
         force: jax.Array,
         finger_gain: jax.Array | float = 1.0,
     ) -> tuple[TaxelMemory, jax.Array]:
-        """One control tick: true forces [F, N] N in, readings [F, N] N out.
-
-        Args:
-          params: of this episode.
-          memory: from the tick before.
-          key: of noise and drift.
-          force: true.
-          finger_gain: [F, 1], factor on all taxels of a finger.
-        """
+        """One control tick: true forces [F, N] N in, readings [F, N] N out; `finger_gain` [F, 1] is on top."""
         sensor, late, walk = self.sensor, memory.late, memory.walk
         value = load = force * finger_gain
         # What is off is None in `params` and `memory` alike.

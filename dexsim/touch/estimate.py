@@ -29,14 +29,8 @@ class ForceEstimate(Config):
 
 
 def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, joint_torque: jax.Array) -> jax.Array:
-    """Estimated force [F] N of each finger: its taxels' sum and a share of what its torque tells beyond it; 0 without
-    touch.
-
-    Args:
-      estimate: its settings.
-      hand: the hand.
-      taxel_force: [F, N] N.
-      joint_torque: [J], over the joints' torque limits.
+    """Estimated force [F] N of each finger: the sum of its `taxel_force` [F, N] N and a share of what its
+    `joint_torque` [J], over the torque limits, tells beyond it; 0 without touch.
 
     Raises:
       ConfigError: `per_torque` is of a hand with another number of fingers.

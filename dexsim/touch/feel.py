@@ -1,8 +1,7 @@
 """What the taxels feel: depth below the object's surface, and the finger's force spread by it.
 
-Method (paper, section Sim-to-Real Transfer): a taxel touches where it lies below the object's
-surface; its share of the finger's force follows the skin's stress at that depth; the finger's
-total is the contact force of the physics.
+Method (paper, section Sim-to-Real Transfer): a taxel touches where it lies below the object's surface; its share of the
+finger's force follows the skin's stress at that depth; the finger's total is the contact force of the physics.
 
 Shapes: F fingers, N taxels a finger. Units: m, N, Pa.
 """
@@ -43,17 +42,15 @@ def feel_links(
 ) -> Touch:
     """What the taxels of a posed hand feel, or other points of its fingertips' skin.
 
-    Args:
-      hand, pose: the hand and where its links are.
-      geometry, position [3], rotation [3, 3]: the object, prepared for any method of
-        `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
-      finger_force: [F] N, resultant fingertip-object force of the physics.
-      skin: the skin's law.
-      surface: other points than the taxels.
-      pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
-
     A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
     that has no taxels.
+
+    Args:
+      geometry, position [3], rotation [3, 3]: the object, prepared for any method of `dexsim.geometry.distance` (a
+        `sdf.Shape` is as it is), and its pose in the palm frame.
+      finger_force: [F] N, resultant fingertip-object force of the physics.
+      surface: other points than the taxels.
+      pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
     """
     surface = surface or taxels_only(hand)
     # From the links' frames directly to the object's: one transform a finger instead of two a taxel.
@@ -76,12 +73,9 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
 
 
 def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
-    """The same touch with only what presses into the skin of the fingers' forces shared among the taxels.
+    """The same touch with only what presses into the skin of the fingers' forces [F, 3] N shared among the taxels.
 
-    Args:
-      touch: its normal forces say where the contact is; a finger that touches nothing keeps 0.
-      normals: [F, N, 3] outward taxel normals, in any frame.
-      finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
+    Outward taxel `normals` [F, N, 3] are in the same frame, whichever. A finger that touches nothing keeps 0.
     """
     inward = -jnp.sum(touch.skin_force[..., None] * normals, -2)
     square = jnp.sum(inward**2, -1, keepdims=True)

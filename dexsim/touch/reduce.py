@@ -11,15 +11,12 @@ from dexsim.hand.kinematics import Hand, HandPose
 
 
 def reduce_touch(force: jax.Array, taxels: jax.Array, weighting: str = "force") -> tuple[jax.Array, jax.Array]:
-    """Per-finger total force and contact centre, the same for simulated and measured taxels.
+    """Total force F_i [F] and contact centre mu_i [F, 3] of each finger; zero for a finger that touches nothing.
 
     Args:
       force: [F, N] N (with weighting "depth": the penetration, the paper's simplification).
       taxels: [F, N, 3] m.
       weighting: "force" (or "depth"): mu_i = sum f_ij p_ij / F_i; "none": mean of active taxels.
-
-    Returns:
-      F_i [F] and mu_i [F, 3]; the centre is zero for a finger that touches nothing.
     """
     weight = (force > 0).astype(force.dtype) if weighting == "none" else force
     total = jnp.sum(weight, -1)

@@ -5,7 +5,6 @@
 Shown is a simulation with a policy, the emulated hand (`--emulated`), or the log of a run on a hand.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,8 +59,7 @@ def open_source(arguments: ViewArguments) -> "Source":
         return Emulation(name, arguments.seed, arguments.hand)
     from dexsim.hand.load import load_hand
     from dexsim.registry import find_task, make
-    from dexsim.view.policies import NONE, PolicyShelf
-    from dexsim.view.simulation import Simulation
+    from dexsim.view.simulation import NONE, PolicyShelf, Simulation
     from dexsim_ppo.policy import load_policy
 
     try:
@@ -85,12 +83,8 @@ def open_source(arguments: ViewArguments) -> "Source":
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
-    arguments = cli.parse(
-        ViewArguments,
-        sys.argv[1:] if argv is None else argv,
-        prog="python -m dexsim.view",
-        description="Show a hand live in the browser.",
-    )
+    description = "Show a hand live in the browser."
+    arguments = cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description)
     # First what is quick to find out: JAX takes seconds to import, the simulation up to a minute to compile.
     require("viser", "view", "the live view")
     print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)

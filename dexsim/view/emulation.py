@@ -18,12 +18,7 @@ from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
 
 
 class Emulation:
-    """Trials of a policy on the emulated hand; each reset is the next one.
-
-    Args:
-      name: a policy file, or the name of a shipped policy.
-      seed: of the trials.
-      hand: TOML of the hand, where it is not in the place that the policy's file names.
+    """Trials of a policy (a file, or a shipped one's name) on the emulated hand; each reset is the next one.
 
     Raises:
       HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.

@@ -14,10 +14,6 @@ from dexsim_real.replay.replay import replay
 class Recording:
     """A replayed log. The object's shape is not in it: its estimated pose is shown as axes.
 
-    Args:
-      path: of the log.
-      hand: TOML of the hand, where it is not in the place that the log names.
-
     Raises:
       LogError: not a log, or one that ends before the hand was ready.
       DexsimError: the policy never ran in it.

@@ -26,13 +26,7 @@ _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
 
 
 class Scene:
-    """A hand in the browser.
-
-    Args:
-      server: of viser.
-      hand: the hand.
-      camera: a preset of `CAMERAS`, which also says where up is.
-    """
+    """A hand in the browser: on a server of viser, seen by a preset of `CAMERAS`, which also says where up is."""
 
     def __init__(self, server: Any, hand: Hand, camera: str):
         self._server, self._hand = server, hand
@@ -43,9 +37,9 @@ class Scene:
         server.scene.configure_default_lights(True, cast_shadow=False)
         server.scene.add_light_ambient("/light", intensity=1.2)
         # Farther away than a film's camera, and to the right: the controls cover that part of the page.
-        seen = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
-        aside = _ASIDE * seen.axes[0]
-        server.initial_camera.position = tuple(seen.origin + aside)
+        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
+        aside = _ASIDE * eye.axes[0]
+        server.initial_camera.position = tuple(eye.origin + aside)
         server.initial_camera.look_at = tuple(view.target + aside)
         server.initial_camera.fov = float(np.deg2rad(view.field_of_view))
         self._links = [server.scene.add_frame(f"/hand/{name}", show_axes=False) for name in hand.body_names]

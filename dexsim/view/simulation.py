@@ -1,35 +1,73 @@
-"""A simulated hand with a policy, one tick a frame."""
+"""A simulated hand with a policy, one tick a frame, and the policies to choose from."""
 
+import contextlib
 import dataclasses
 import functools
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
+from dexsim.core.errors import CheckpointError
 from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
 from dexsim.render.render import CAMERAS
-from dexsim.view.policies import PolicyShelf
 from dexsim.view.source import Button, Choice, Control, Frame, Slider, Values
+from dexsim_ppo.policy import Policy, load_policy
 
 _ANY = "any"
 _PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
 _SHOWN = 1.0  # s that a dropped object stays in sight
 
 
-class Simulation:
-    """Episodes of an environment; the page chooses policy, object, command, friction and pushes.
+NONE = "none"
+"""The choice of no policy: actions are zero."""
+_NEWEST = 20  # files of runs that are listed
 
-    Args:
-      env: made for one environment.
-      policies: to choose from.
-      seed: of the episodes.
-    """
+
+class PolicyShelf:
+    """Policies that take an environment's observation, by the name of a shipped one or the path of a file, which is
+    read again when it changes. The view begins with `first`."""
+
+    def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
+        self._layout, self._runs, self._first = tuple(env.observation_layout["actor"]), runs, first
+        self._shipped = sorted(path.stem for path in asset_path("policies").glob("*.msgpack"))
+        self._loaded: dict[str, tuple[float, Policy | None]] = {}
+
+    def names(self) -> tuple[str, ...]:
+        """What can be chosen now: the first policy, then shipped ones, then the newest files of runs."""
+        files = [path for name in ("best", "last") for path in self._runs.glob(f"*/{name}.msgpack")]
+        newest = sorted(files, key=_changed, reverse=True)[:_NEWEST]
+        listed = dict.fromkeys([self._first, *self._shipped, *map(str, newest), NONE])
+        return tuple(name for name in listed if name == NONE or self.get(name) is not None)
+
+    def get(self, name: str) -> Policy | None:
+        """The policy of this name as its file is now; None where it is unsound, does not fit, or is `NONE`."""
+        if name == NONE:
+            return None
+        time = 0.0 if name in self._shipped else _changed(Path(name))
+        read, policy = self._loaded.get(name, (-1.0, None))
+        if time != read:
+            with contextlib.suppress(CheckpointError, OSError):  # being replaced: keep its last sound policy
+                new = load_policy(name)
+                policy = new if new.observation_layout == self._layout else None
+            self._loaded[name] = time, policy
+        return policy
+
+
+def _changed(path: Path) -> float:
+    """When a file was last written, s; 0 if it is gone."""
+    return path.stat().st_mtime if path.exists() else 0.0
+
+
+class Simulation:
+    """Episodes of an environment; the page chooses policy, object, command, friction and pushes."""
 
     def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies

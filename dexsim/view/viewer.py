@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim.core.install import require
 from dexsim.render.panel import FELT, Layout, draw_panel, make_layout, read_outs
 from dexsim.view.scene import Scene
 from dexsim.view.source import Choice, Control, Frame, Slider, Source
@@ -22,19 +21,13 @@ _CHOICES = 3.0  # s between two looks for new choices
 
 
 class Viewer:
-    """A source in the browser.
-
-    Args:
-      source: what is shown.
-      title: of the page.
-      host, port: where the page is served.
+    """A source in the browser, on a page that is served at a host and port.
 
     Raises:
-      DexsimError: viser is not installed, or `host` is no address of this computer.
+      DexsimError: `host` is no address of this computer.
     """
 
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
-        require("viser", "view", "the live view")
         import viser
 
         self.source, hand = source, source.hand

@@ -7,11 +7,10 @@
     ppo.train(env, wrap_env_fn=wrap, episode_length=env.episode_length,
               network_factory=factory, ...)
 
-brax knows one `done`. Its convention, kept here: the environment reports `done` only where the task
-*terminated*, and the time limit is a wrapper's, which marks those steps in `info["truncation"]` so
-that the trainer does not take them for failures. With `wrap` the task's own time limit does that.
-brax's standard wrappers work too, with their own limit (`episode_length`) and their own restart:
-every environment returns to the one start state it was first given (random numbers move on).
+brax knows one `done`. Its convention, kept here: the environment reports `done` only where the task *terminated*, and
+the time limit is a wrapper's, which marks those steps in `info["truncation"]`. With `wrap` the task's own time limit
+does that. brax's standard wrappers work too, with their own limit (`episode_length`) and their own restart: every
+environment returns to the one start state it was first given (random numbers move on).
 """
 
 import dataclasses
@@ -80,12 +79,12 @@ class BraxEnv(Env):
 
     def restart(self, state: State, done: jax.Array) -> State:
         """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
-        begun = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
-        return begun.replace(
+        restarted = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
+        return restarted.replace(
             reward=state.reward,
             done=state.done,
             metrics=state.metrics,
-            info={**begun.info, "time_limit": state.info["time_limit"]},
+            info={**restarted.info, "time_limit": state.info["time_limit"]},
         )
 
     @property
@@ -118,15 +117,13 @@ class BraxEnv(Env):
         carried, info = (last.metrics, last.info) if last is not None else ({}, {})
         terminated = state.terminated.astype(jnp.float32)
         time_limit = state.truncated.astype(jnp.float32) * (1 - terminated)
+        own = {name: x.astype(jnp.float32) for name, x in state.metrics.items() if name not in _RUNNING_METRICS}
         return State(
             pipeline_state=jax.tree.map(_raw, state),
             obs=dict(state.obs) if self._group is None else state.obs[self._group],
             reward=state.reward.astype(jnp.float32),
             done=terminated,
-            metrics=carried
-            | {
-                name: value.astype(jnp.float32) for name, value in state.metrics.items() if name not in _RUNNING_METRICS
-            },
+            metrics=carried | own,
             info={**info, "key": jax.random.key_data(state.key), "time_limit": time_limit},
         )
 
@@ -159,19 +156,14 @@ class Restart(Wrapper):
 
 
 def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
-    """For the argument `wrap_env_fn` of brax's trainers: vmap, time limit, restart.
-
-    Args:
-      episode_length: the longest episode in ticks; the task's own time limit may come before it.
+    """For the argument `wrap_env_fn` of brax's trainers: vmap, time limit, restart. The task's own time limit may come
+    before `episode_length`, ticks.
 
     Raises:
       ConfigError: `randomization_fn` is given; our environments randomise themselves.
     """
     if randomization_fn is not None:
-        raise ConfigError(
-            "randomization_fn: the task draws new parameters at every episode start "
-            "by itself; set its `randomization` config instead"
-        )
+        raise ConfigError("randomization_fn: the task draws its own parameters; set its `randomization` config instead")
     return Restart(TimeLimit(VmapWrapper(env), episode_length, action_repeat))
 
 

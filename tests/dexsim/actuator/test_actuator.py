@@ -81,15 +81,6 @@ def test_ten_thousand_random_drives():
     assert all(regime.sum() > 200 for regime in regimes)
 
 
-@pytest.mark.parametrize("push", [1, -1])
-@pytest.mark.parametrize("turn", [1, -1])
-def test_four_quadrants(push, turn):
-    """Driving and braking alike are held to tau_0 (1 - |qd| / qd_max), with the sign of what is asked for."""
-    velocity = turn * 8.63 / 4
-    torque = joint_torque(motor(), push * 10.0, 0.0, 0.0, velocity)
-    assert float(torque) == pytest.approx(push * 1.1 * 0.75, rel=1e-6)
-
-
 def test_the_edges_of_the_dead_band():
     """|error| < epsilon is dead, |error| = epsilon is not; on exact binary fractions."""
     sticky = motor(dead_band=0.125, damping=0.0)
@@ -103,25 +94,9 @@ def test_the_edges_of_the_dead_band():
     assert float(joint_torque(motor(), 0.0, 0.0, 0.0, 3.0)) == pytest.approx(-0.3)
 
 
-# --- latency -------------------------------------------------------------------------------------
-
-
 def test_a_delay_within_a_substep_is_the_mean_over_it():
     acts = [float(delayed_target(jnp.int32(k), jnp.float32(1.25), -jnp.ones(()), jnp.ones(()))) for k in range(3)]
     np.testing.assert_allclose(acts, [-1.0, 0.5, 1.0])
-
-
-def test_delay_within_a_scan_of_substeps():
-    """The sub-step at which the target starts to act, seen from inside a tick, for each environment of a batch."""
-
-    def tick(latency):
-        return jax.lax.scan(
-            lambda carry, k: (carry, delayed_target(k, latency, jnp.zeros(2), jnp.ones(2))), 0, jnp.arange(6)
-        )[1]
-
-    seen = jax.jit(jax.vmap(tick))(jnp.arange(7))
-    np.testing.assert_array_equal(seen[..., 0].sum(1), [6, 5, 4, 3, 2, 1, 0])
-    np.testing.assert_array_equal(np.argmax(seen[:6, :, 0], 1), np.arange(6))
 
 
 # --- ripple, encoder, friction ----------------------------------------------------------------------
@@ -177,25 +152,6 @@ def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velo
     return np.asarray(jax.lax.scan(body, jnp.float32(velocity), wanted)[1])
 
 
-def test_coulomb_friction_stops_in_time_and_holds():
-    """v(t) = v0 - c t / I, exactly 0 from v0 I / c on; held up to c, let go beyond."""
-    for sign in (1, -1):
-        speed = slide(0.0, coulomb=0.02, velocity=sign * 4.0)
-        times = 1e-3 * np.arange(1, 1001)
-        np.testing.assert_allclose(speed, sign * np.maximum(4.0 - 20.0 * times, 0), atol=2e-4)
-        assert np.all(speed[201:] == 0)
-        assert np.all(slide(sign * 0.0199, coulomb=0.02) == 0)
-        np.testing.assert_allclose(slide(sign * 0.03, coulomb=0.02)[-1], sign * 10.0, rtol=1e-4)
-
-
-def test_viscous_friction_settles_at_torque_over_b():
-    speed = slide(0.03, coulomb=0.01, viscous=0.02, steps=2000)
-    np.testing.assert_allclose(speed[-1], (0.03 - 0.01) / 0.02, rtol=1e-5)
-    times = 1e-3 * np.arange(1, 2001)  # backward Euler of v' = (tau - c - b v) / I
-    np.testing.assert_allclose(speed, 1 - (1 + 1e-3 * 0.02 / 1e-3) ** -np.arange(1, 2001), atol=1e-4)
-    np.testing.assert_allclose(speed, 1 - np.exp(-0.02 / 1e-3 * times), atol=0.01)
-
-
 def c_hinge(coulomb, viscous, torque, timestep=5e-4):
     """Angles and speeds of a hinge with frictionloss and damping in C MuJoCo."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -226,28 +182,6 @@ def test_friction_is_c_mujocos(coulomb, viscous):
 
 
 # --- every parameter is a leaf -------------------------------------------------------------------
-
-
-def gradient(drive, *state):
-    return jax.jit(jax.grad(actuator.joint_torque))(drive, *(jnp.float32(x) for x in state))
-
-
-def test_gradients_where_the_motor_is_free():
-    """tau = eta (kp e - kd qd): e = 0.1, qd = 1."""
-    slope = gradient(motor(efficiency=0.9), 0.1, 0.0, 0.0, 1.0)
-    assert float(slope.stiffness) == pytest.approx(0.9 * 0.1, rel=1e-5)
-    assert float(slope.damping) == pytest.approx(-0.9, rel=1e-5)
-    assert float(slope.efficiency) == pytest.approx(3 * 0.1 - 0.1, rel=1e-5)
-    assert float(slope.stall_torque) == float(slope.no_load_speed) == float(slope.dead_band) == 0
-
-
-def test_gradients_where_the_envelope_holds():
-    """tau = eta tau_0 (1 - qd / qd_max): qd = 2."""
-    slope = gradient(motor(efficiency=0.9), 2.0, 0.0, 0.0, 2.0)
-    assert float(slope.stall_torque) == pytest.approx(0.9 * (1 - 2 / 8.63), rel=1e-5)
-    assert float(slope.no_load_speed) == pytest.approx(0.9 * 1.1 * 2 / 8.63**2, rel=1e-5)
-    assert float(slope.efficiency) == pytest.approx(1.1 * (1 - 2 / 8.63), rel=1e-5)
-    assert float(slope.stiffness) == float(slope.damping) == 0
 
 
 def test_a_drive_is_at_its_limit_where_it_gives_less_than_its_loop_asks_for():

@@ -17,28 +17,18 @@ from dexsim.calibration.fit import calibrate
 from dexsim.calibration.joint import JointPress, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
-    current_from_counts,
     joint_torque,
     load_calibration,
     normalise,
-    normalised_torque,
     save_calibration,
     taxel_force,
 )
 from dexsim.calibration.plot import plot_calibration
 from dexsim.calibration.press import MIN_LEVER, lever_arms
 from dexsim.core.errors import CalibrationError
-from dexsim.core.robust_line import fit_line, long_run, theil_sen
+from dexsim.core.robust_line import fit_line, theil_sen
 
 # --- lines -----------------------------------------------------------------------------------
-
-
-def test_a_line_without_noise_is_found_exactly():
-    x = np.linspace(0, 8, 50)
-    line = fit_line(x, -0.03 * x + 0.2)
-    assert line.gain == pytest.approx(-0.03, rel=1e-12) and line.offset == pytest.approx(0.2, rel=1e-12)
-    assert line.r_squared == pytest.approx(1.0) and line.outliers == 0
-    assert np.ptp(line.gain_interval) < 1e-9
 
 
 def test_on_clean_data_it_is_least_squares_and_so_are_its_intervals():
@@ -77,13 +67,6 @@ def test_intervals_hold_the_truth(rho, least):
     assert np.all(hits / 300 >= least) and np.all(hits / 300 <= 0.985)
 
 
-def test_the_long_run_variance_of_an_ar1_series():
-    """Known: (1 + rho) / (1 - rho) times that of white noise."""
-    rng = np.random.default_rng(3)
-    variance = np.mean([long_run(ar1(rng, 4000, 0.5)[:, None])[0, 0] / 4000 for _ in range(20)])
-    assert variance == pytest.approx(3.0, rel=0.12)
-
-
 @pytest.mark.parametrize("kind", ["random", "one-sided", "dropped"])
 def test_gain_within_two_percent_at_five_percent_outliers(kind):
     """100 recordings each; outliers of up to 20 times the noise, all to one side, or reads of 0."""
@@ -115,7 +98,6 @@ MOTOR = Motor(
     resolution=0.001,
 )
 LEVER = 0.06
-SOME = ("thumb_bend", "index_joint1", "index_joint2", "index_bend")
 
 
 def recording(seed=0, motor=MOTOR, **options):
@@ -154,23 +136,6 @@ def fitted(hand):
     return calibrated(hand)
 
 
-def test_run_time_torque_is_the_motors(hand, fitted):
-    """The current that a known motor draws while pressing comes back as the torque on the joint."""
-    calibration = fitted[0]
-    torque = np.linspace(0.02, 0.45, 12)
-    loading = torque / (0.9 * 0.8) + 0.024
-    unloading = torque * 0.7 / 0.9 - 0.016
-    np.testing.assert_allclose(joint_torque(calibration, loading, 1.0), torque, rtol=0.03, atol=0.004)
-    np.testing.assert_allclose(joint_torque(calibration, unloading, -1.0), torque, rtol=0.03, atol=0.004)
-    unknown = np.asarray(joint_torque(calibration, loading))
-    band = np.asarray(calibration.real.friction) * np.abs(
-        np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
-    )
-    assert np.all(np.abs(unknown - torque) < 2 * band + 0.005)
-    normalised = normalised_torque(calibration, loading, 1.0)
-    np.testing.assert_allclose(normalised, joint_torque(calibration, loading, 1.0) / hand.torque_limit, rtol=1e-5)
-
-
 def test_a_hand_that_counts_backwards(hand, fitted):
     """Currents negative while closing, as the XHand's: torques positive all the same."""
     calibration, real, sim = fitted
@@ -181,20 +146,6 @@ def test_a_hand_that_counts_backwards(hand, fitted):
     force, value = normalise(other.real, 0, turned["thumb_bend"].force, turned["thumb_bend"].value)
     for axis in (force, value):  # the paper's [0, 1]
         assert axis.max() == pytest.approx(1.0, abs=0.02) and axis.min() > -0.1
-
-
-def test_maps_under_jit_and_vmap(fitted):
-    calibration = fitted[0]
-    current = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, (7, 12)), jnp.float32)
-    plain = normalised_torque(calibration, current)
-    closed = jax.jit(lambda c: normalised_torque(calibration, c))(current)
-    passed = jax.jit(jax.vmap(normalised_torque, (None, 0)))(calibration, current)
-    np.testing.assert_allclose(closed, plain, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(passed, plain, rtol=1e-5, atol=1e-6)
-    slope = jax.grad(lambda c: joint_torque(calibration, c)[3])(current[0])
-    gain = np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
-    np.testing.assert_allclose(slope, np.where(np.arange(12) == 3, gain, 0), rtol=1e-5)
-    np.testing.assert_allclose(current_from_counts(calibration, jnp.array([250.0])), 0.25)
 
 
 def test_taxel_counts_become_newtons(fitted):
@@ -235,21 +186,11 @@ def test_joints_without_a_recording_take_their_class(hand):
         calibrated(hand, names=some, force_per_count=2.0)  # What could not be read again is not made.
 
 
-@pytest.mark.parametrize("side", ["on the hand", "in simulation"])
-def test_a_class_of_both_signs_has_no_mean(hand, side):
-    _, *sides = calibrated(hand, names=SOME)
-    turned = sides[side == "in simulation"]
-    turned["index_joint2"] = dataclasses.replace(turned["index_joint2"], value=-turned["index_joint2"].value)
-    with pytest.raises(CalibrationError, match=f"gain signs differ {side} between index_joint2 and index_bend"):
-        calibrate(hand, *sides)
-
-
-def test_one_direction_stands_for_both(fitted):
-    data = recording()
-    only = JointPress(data.force, data.value, np.where(find_direction(data.force) > 0, 1, 0))
-    one_way = fit_joint(only, "A")
-    assert one_way.unloading is None and math.isnan(one_way.friction)
-    assert any("friction and offset are not apart" in note for note in one_way.notes)
+def test_a_class_of_both_signs_has_no_mean(hand):
+    _, real, sim = calibrated(hand, names=("thumb_bend", "index_joint1", "index_joint2", "index_bend"))
+    real["index_joint2"] = dataclasses.replace(real["index_joint2"], value=-real["index_joint2"].value)
+    with pytest.raises(CalibrationError, match="gain signs differ on the hand between index_joint2 and index_bend"):
+        calibrate(hand, real, sim)
 
 
 def test_directions_of_a_noisy_triangle():
@@ -305,15 +246,13 @@ def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
     assert jax.tree.structure(back) == jax.tree.structure(original)
     for ours, theirs in zip(jax.tree.leaves(back), jax.tree.leaves(original), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    text = path.read_text()
-    assert 'name = "thumb_bend"' in text and "# A" in text  # for people too
 
 
 def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
     path = tmp_path / "c.toml"
     save_calibration(path, fitted[0])
     whole = path.read_bytes()
-    for length in [*range(0, len(whole) - 1, 97), *range(len(whole) - 30, len(whole) - 1)]:
+    for length in [*range(0, len(whole) - 1, 197), *range(len(whole) - 30, len(whole) - 1)]:
         path.write_bytes(whole[:length])
         with pytest.raises(CalibrationError) as caught:
             load_calibration(path, hand)

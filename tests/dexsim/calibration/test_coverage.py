@@ -16,21 +16,6 @@ def inside(estimate, truth):
     return estimate[0] <= truth <= estimate[1]
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.95])
-def test_a_joints_lines_hold_the_truth(correlation):
-    hits = np.zeros(4)
-    for seed in range(TRIALS):
-        force, value = varied_presses(
-            np.random.default_rng([1, seed]), gain=0.05, offset=0.02, friction=0.01, correlation=correlation
-        )
-        found = fit_joint(JointPress(force, value), "A")
-        for k, (line, offset) in enumerate(((found.loading, 0.03), (found.unloading, 0.01))):
-            hits[2 * k] += inside(line.gain_interval, 0.05)
-            hits[2 * k + 1] += inside(line.offset_interval, offset)
-            assert np.ptp(line.gain_interval) < 0.3 * 0.05  # says something
-    assert np.all(hits >= 0.9 * TRIALS), hits
-
-
 def test_a_sensors_line_and_threshold_hold_the_truth():
     hits = np.zeros(3)
     for seed in range(TRIALS):
@@ -87,10 +72,3 @@ def test_what_no_sample_shows_is_added_in_quadrature():
     plain, known = (fit_joint(JointPress(force, value, gain_error=share), "A") for share in (0.0, 0.3))
     assert np.ptp(known.loading.gain_interval) > 0.03 > np.ptp(plain.loading.gain_interval)
     assert known.loading.offset_interval == plain.loading.offset_interval and known.notes == plain.notes
-
-
-def test_few_presses_are_said():
-    for presses, said in ((2, True), (3, False)):
-        force, value = varied_presses(np.random.default_rng(5), presses=presses)
-        notes = fit_joint(JointPress(force, value), "A").notes
-        assert any("fewer than 3 presses" in note for note in notes) == said

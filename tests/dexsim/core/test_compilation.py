@@ -4,7 +4,6 @@ import jax
 import pytest
 
 from dexsim.core import compilation
-from dexsim.core.compilation import EMITTERS
 
 
 @pytest.fixture
@@ -20,13 +19,6 @@ def options(monkeypatch):
         return chosen["o"] or {}
 
     return choose
-
-
-def test_only_programs_that_are_mostly_physics_do_without_fast_networks(options):
-    assert EMITTERS in options(backend="mjx")
-    assert EMITTERS not in options(backend="own") and options(backend="own")
-    assert options(backend="c") == {}
-    assert options(backend="c", once=True)["xla_backend_optimization_level"] == 0
 
 
 def test_programs_on_a_gpu_are_made_deterministic_on_request(options, monkeypatch):

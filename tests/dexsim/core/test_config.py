@@ -10,16 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim.core.config import Config, check_ranges, from_dict, naming_file, override, setting, to_dict, validate
+from dexsim.core.config import Config, check_ranges, from_dict, override, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
-from dexsim.physics.config import PhysicsConfig
 from dexsim.randomization import Randomization
-from dexsim.tasks.grasp.config import GraspConfig, GraspReward
+from dexsim.tasks.grasp.config import GraspConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Spring:
+class Spring(Config):
     stiffness: float = setting(2.0, unit="N/m", low=0.5, high=8.0)
     turns: int = setting(3, low=1)
     rest: float = setting(0.0, unit="m", high=0.1)
@@ -28,19 +27,17 @@ class Spring:
     marks: tuple[str, ...] = setting((), choices=("red", "blue"))
     name: str | None = setting(None)
     wound: bool = setting(True)
+    side: typing.Literal["left", "right"] | None = None
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "span")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Chair:
+class Chair(Config):
+    legs: int = setting()
     seat: Spring = setting(Spring())
-    legs: int = setting(4)
-
-    def __post_init__(self):
-        validate(self)
 
 
 def message(build, *arguments, **keywords):
@@ -56,7 +53,6 @@ REFUSED = [
     (dict(turns=0), "Spring.turns = 0: must be at least 1"),
     (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
     (dict(stiffness="2"), "Spring.stiffness = '2': expected float"),
-    (dict(stiffness=None), "Spring.stiffness = None: expected float"),
     (dict(turns=3.0), "Spring.turns = 3.0: expected int"),
     (dict(turns=True), "Spring.turns = True: expected int"),
     (dict(span=1.0), "Spring.span = 1.0: expected a list"),
@@ -67,6 +63,7 @@ REFUSED = [
     (dict(marks=("red", "green")), "Spring.marks = 'green': choose from red, blue"),
     (dict(name=4), "Spring.name = 4: expected str"),
     (dict(wound="no"), "Spring.wound = 'no': expected bool"),
+    (dict(side="top"), "Spring.side = 'top': choose from left, right"),
     (dict(stiffness=math.nan), "Spring.stiffness = nan: must be a finite number"),
 ]
 
@@ -74,56 +71,10 @@ REFUSED = [
 @pytest.mark.parametrize(("fields", "expected"), REFUSED)
 def test_a_wrong_value_is_named_with_its_range_in_code_and_in_a_file(fields, expected):
     assert message(Spring, **fields) == expected
-    assert message(from_dict, Chair, {"seat": fields}) == expected
-
-
-def nested_configs(cls):
-    yield cls
-    for field in dataclasses.fields(cls):
-        hint = typing.get_type_hints(cls)[field.name]
-        if dataclasses.is_dataclass(hint):
-            yield from nested_configs(hint)
-
-
-def test_every_number_of_the_grasp_config_has_a_range_that_is_enforced():
-    """Whatever the field, a value far below and far above is refused, by name."""
-    checked = 0
-    for cls in set(nested_configs(GraspConfig)):
-        for field in dataclasses.fields(cls):
-            value = getattr(cls(), field.name)
-            first = value[0] if isinstance(value, tuple) and value else value
-            if isinstance(first, (bool, str)) or not isinstance(first, (int, float)):
-                continue
-            for bad in (-1e9, 1e9):
-                bad = type(first)(bad)
-                text = message(cls, **{field.name: (bad,) * len(value) if isinstance(value, tuple) else bad})
-                assert f"{cls.__name__}.{field.name} = {bad:.0f}" in text
-                unit = field.metadata["unit"]
-                assert unit in ("", "1") or unit in text
-            checked += 1
-    assert checked > 60
+    assert message(from_dict, Chair, {"legs": 4, "seat": fields}) == expected
 
 
 # --- dictionaries ------------------------------------------------------------------------------------
-
-
-def test_the_round_trip_of_the_grasp_config():
-    for config in (
-        GraspConfig(),
-        GraspConfig(
-            finger_force=(0.5, 9.0),
-            pool_size=17,
-            reward=GraspReward(sigma=0.2, thumb="binary"),
-            objects=ObjectConfig(shapes=("box",), mass=(0.1, 0.1)),
-            physics=PhysicsConfig(timestep=0.004),
-            randomization=Randomization(scale=0.5),
-        ),
-    ):
-        plain = to_dict(config)
-        again = from_dict(GraspConfig, json.loads(json.dumps(plain)))
-        assert again == config and type(again.reward) is GraspReward
-        assert again.objects.shapes == config.objects.shapes and isinstance(again.objects.shapes, tuple)
-        assert hash(again) == hash(config)  # usable as a static argument
 
 
 @given(
@@ -141,70 +92,33 @@ def test_any_config_survives_the_round_trip(stiffness, turns, low, high, wire, m
         stiffness=stiffness, turns=turns, span=(low, high), wire=wire, marks=tuple(marks), name=name, wound=wound
     )
     chair = Chair(seat=spring, legs=3)
-    assert from_dict(Chair, to_dict(chair)) == chair
-    assert from_dict(Chair, json.loads(json.dumps(to_dict(chair)))) == chair
+    again = from_dict(Chair, json.loads(json.dumps(to_dict(chair))))
+    assert again == chair and hash(again) == hash(chair)  # usable as a static argument
 
 
 @pytest.mark.parametrize(
     ("data", "expected"),
     [
         ({"backs": 1}, "Chair has no field 'backs'"),
-        ({"seat": {"colour": "red"}}, "Spring has no field 'colour'"),
-        ({"seat": 3}, "Spring: expected a table of fields, got int"),
-        ([], "Chair: expected a table of fields, got list"),
+        ({"seat": {}}, "Chair.legs is missing"),
+        ({"legs": 4, "seat": {"colour": "red"}}, "Spring has no field 'colour'"),
+        ({"legs": 4, "seat": 3}, "Spring: expected a table of fields, got int"),
     ],
 )
 def test_a_dictionary_of_other_fields_is_an_error(data, expected):
     assert message(from_dict, Chair, data) == expected
 
 
-def test_errors_of_a_file_begin_with_its_name():
-    with pytest.raises(ConfigError, match=r"^hand\.toml: Spring\.stiffness = 9 N/m: must be between 0\.5 and 8 N/m$"):
-        with naming_file("hand.toml"):
-            from_dict(Spring, {"stiffness": 9.0})
-
-
-def test_literal_types_are_choices():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Door:
-        side: typing.Literal["left", "right"] | None = None
-        marks: tuple[typing.Literal[1, 2], ...] = ()
-
-        def __post_init__(self):
-            validate(self)
-
-    assert Door(side="left", marks=(1, 2)) and Door(side=None)
-    assert message(Door, side="top") == "Door.side = 'top': choose from left, right"
-    assert message(Door, marks=(3,)) == "Door.marks = 3: choose from 1, 2"
-
-
 def test_override_replaces_fields_by_their_path():
     plain = to_dict(GraspConfig())
-    before = json.dumps(plain)
-    changed = override(
-        plain,
-        [
-            "objects.extremes=0.5",
-            'objects.shapes=["box"]',
-            "randomization.latency=[0, 0.01]",
-            "episode_seconds=3",
-        ],
+    changed = override(plain, ["objects.extremes=0.5", 'objects.shapes=["box"]', "randomization.latency=[0, 0.01]"])
+    assert from_dict(GraspConfig, changed) == GraspConfig(
+        objects=ObjectConfig(extremes=0.5, shapes=("box",)), randomization=Randomization(latency=(0.0, 0.01))
     )
-    config = from_dict(GraspConfig, changed)
-    assert json.dumps(plain) == before
-    wanted = dataclasses.replace(
-        GraspConfig(),
-        episode_seconds=3.0,
-        objects=dataclasses.replace(ObjectConfig(), extremes=0.5, shapes=("box",)),
-        randomization=dataclasses.replace(Randomization(), latency=(0.0, 0.01)),
-    )
-    assert config == wanted
     # Numbers as Python has them, in lists too.
     for text, number in ((".006", 0.006), ("6e-3", 0.006), ("5.", 5.0), ("-.5", -0.5)):
         assert override({}, [f"physics.timestep={text}"]) == {"physics": {"timestep": number}}
     assert override({}, ["edge=[.05, 1.]"]) == {"edge": [0.05, 1.0]}
-    # A field that the file does not have yet.
-    assert from_dict(GraspConfig, override({}, ["objects.extremes=1"])).objects.extremes == 1.0
     for entry, said in (
         ("objects.extreme=1", "ObjectConfig has no field 'extreme'"),
         ("objects.extremes=much", "expected float"),
@@ -220,12 +134,3 @@ def test_numbers_of_numpy_become_pythons():
     assert spring == from_dict(Spring, json.loads(json.dumps(to_dict(spring))))
     assert type(spring.turns) is int and type(spring.stiffness) is float and spring.span == (0.5, 1)
     assert Spring(span=np.array([0.25, 0.5])).span == (0.25, 0.5) and hash(spring)
-
-
-def test_a_field_without_a_default_must_be_given():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Nail(Config):
-        length: float = setting(unit="m", low=0.0, high=1.0)
-
-    assert from_dict(Nail, {"length": 1}).length == 1.0
-    assert message(from_dict, Nail, {}) == "Nail.length is missing"

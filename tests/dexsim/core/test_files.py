@@ -4,15 +4,11 @@ import os
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 
 from dexsim.core import cli
-from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import ConfigError, DexsimWarning
-from dexsim.core.files import make_private, read_toml, write_whole
-
-# Writes half of a file, says so, and waits to be killed.
+from dexsim.core.files import make_private, write_whole
 
 
 def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
@@ -48,11 +44,6 @@ def test_what_a_command_writes_replaces_nothing_that_it_reads_or_wrote(tmp_path,
     cli.check_apart({"--output": Path("grasp")}, {"policy": "grasp"})  # a name, and no file
 
 
-def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):
-    (tmp_path / "hand.toml").write_bytes(b"\xef\xbb\xbfname = 'from a spreadsheet'\r\n")
-    assert read_toml(tmp_path / "hand.toml") == {"name": "from a spreadsheet"}
-
-
 def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
     def chunks():
         yield b"x" * 2**20
@@ -62,22 +53,6 @@ def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_whole(tmp_path / "file", chunks())
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
-
-
-def test_cached_arrays_are_made_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-    made = []
-
-    def make():
-        made.append(1)
-        return {"x": np.arange(3)}
-
-    for key in ("a", "a", "b"):
-        np.testing.assert_array_equal(cached_arrays("numbers", key, make)["x"], [0, 1, 2])
-    assert len(made) == 2
-    for path in (tmp_path / "numbers").iterdir():
-        path.write_bytes(b"damaged")
-    assert cached_arrays("numbers", "a", make)["x"][2] == 2 and len(made) == 3
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o444])

@@ -6,9 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
@@ -110,29 +107,6 @@ def reference(kind, size, points):
     return np.where(is_inside(kind, size, points), -gap, gap)
 
 
-def surface_samples(kind, size, step=4e-4):
-    """Points all over the surface, about `step` apart, edges included."""
-    a, b, c = (float(s) for s in size)
-    if kind == "box":
-        faces = []
-        for axis in range(3):
-            u, v = (np.linspace(-s, s, int(2 * s / step) + 2) for s in np.delete(size, axis))
-            face = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-            faces += [np.insert(face, axis, side * size[axis], axis=1) for side in (-1, 1)]
-        return np.concatenate(faces)
-    if kind in ("sphere", "ellipsoid"):
-        return fibonacci(120_000) * (size if kind == "ellipsoid" else a)
-    rim = np.linspace(0, 2 * np.pi, int(2 * np.pi * a / step) + 2)
-    rim = np.stack([np.cos(rim), np.sin(rim), 0 * rim], -1)
-    rise = np.linspace(-b, b, int(2 * b / step) + 2)[:, None, None] * [0, 0, 1]
-    tube = (a * rim + rise).reshape(-1, 3)
-    if kind == "cylinder":
-        disc = (np.linspace(0, a, int(a / step) + 2)[:, None, None] * rim).reshape(-1, 3)
-        return np.concatenate([tube, disc + [0, 0, b], disc - [0, 0, b]])
-    ends = a * fibonacci(40_000)
-    return np.concatenate([tube, ends + np.sign(ends[:, 2:]) * [0, 0, b]])
-
-
 def probes(size, count=150, seed=0):
     """Points inside, near and outside, on axes and on symmetry planes, and the centre."""
     rng = np.random.default_rng(seed)
@@ -173,19 +147,15 @@ distance_and_normal = jax.jit(sdf.distance_and_normal)
 # --- single primitives ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", sdf.KINDS)
-def test_distance_to_the_nearest_surface_point(kind):
-    points = probes(SIZES[kind])
-    wanted = reference(kind, SIZES[kind], points.astype(float))
+PROPORTIONS = [(0.02, 0.02, 0.02), (0.05, 0.01, 0.01), (0.03, 0.03, 0.01), (0.011, 0.05, 0.012)]
+
+
+@pytest.mark.parametrize(("kind", "size"), [*SIZES.items(), *(("ellipsoid", size) for size in PROPORTIONS)])
+def test_distance_to_the_nearest_surface_point(kind, size):
+    points = probes(size)
+    wanted = reference(kind, size, points.astype(float))
     assert (wanted < -1e-3).sum() > 10 and (wanted > 1e-3).sum() > 10
-    np.testing.assert_allclose(distance(points, one(kind, SIZES[kind])), wanted, atol=2e-6)
-
-
-@pytest.mark.parametrize("size", [(0.02, 0.02, 0.02), (0.05, 0.01, 0.01), (0.03, 0.03, 0.01), (0.011, 0.05, 0.012)])
-def test_ellipsoids_of_all_proportions(size):
-    points = probes(size, seed=1)
-    wanted = reference("ellipsoid", size, points.astype(float))
-    np.testing.assert_allclose(distance(points, one("ellipsoid", size)), wanted, atol=1e-5)
+    np.testing.assert_allclose(distance(points, one(kind, size)), wanted, atol=1e-5 if size in PROPORTIONS else 2e-6)
 
 
 @pytest.mark.parametrize("kind", sdf.KINDS)
@@ -219,22 +189,6 @@ def pose_gradients(points, shape):
     return jax.grad(total, argnums=(0, 1, 2, 3))(points, shape.size, shape.position, shape.rotation)
 
 
-# --- invariances -----------------------------------------------------------------------------------
-
-
-@given(st.sampled_from(sdf.KINDS), st.integers(0, 10**6))
-def test_distance_knows_no_frame(kind, seed):
-    rng = np.random.default_rng(seed)
-    size = rng.uniform(0.01, 0.04, 3).astype(np.float32)
-    points = rng.uniform(-0.08, 0.08, (150, 3))
-    turn, shift = random_rotation(rng), rng.uniform(-0.2, 0.2, 3)
-    before, normal = distance_and_normal(np.float32(points), one(kind, size))
-    after, turned = distance_and_normal(np.float32(points @ turn.T + shift), one(kind, size, shift, turn))
-    np.testing.assert_allclose(after, before, atol=1e-6)
-    smooth = np.linalg.norm(normal, axis=1) > 0.999
-    np.testing.assert_allclose((np.asarray(turned) @ turn)[smooth], np.asarray(normal)[smooth], atol=2e-2)
-
-
 # --- unions ----------------------------------------------------------------------------------------
 
 
@@ -251,37 +205,26 @@ def posed_union(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_union_is_exact_outside(seed):
-    """Against samples of the outer surface only: of each primitive, those outside of all the others."""
+def test_a_union_is_the_nearest_of_its_primitives(seed):
     kinds, size, position, rotation, shape = posed_union(seed)
-    skin = []
-    for k, kind in enumerate(kinds):
-        points = surface_samples(kind, size[k]) @ rotation[k].T + position[k]
-        for other, name in enumerate(kinds):
-            if other != k:
-                points = points[~is_inside(name, size[other], (points - position[other]) @ rotation[other])]
-        skin.append(points)
-    probe = np.random.default_rng(seed + 10).uniform(-0.09, 0.09, (400, 3))
-    inside = np.any(
-        [is_inside(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)], axis=0
+    probe = np.random.default_rng(seed + 10).uniform(-0.09, 0.09, (400, 3)).astype(np.float32)
+    wanted = np.min(
+        [reference(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)], axis=0
     )
-    ours = np.asarray(distance(probe.astype(np.float32), shape))
-    assert np.array_equal(ours < 0, inside) and inside.sum() > 3
-    gap = cKDTree(np.concatenate(skin)).query(probe[~inside])[0]
-    # Samples lie up to 0.4 mm apart, so they can only be farther, and by less than that.
-    assert np.all(gap - ours[~inside] > -2e-6) and np.all(gap - ours[~inside] < 4e-4)
-    assert np.median(gap - ours[~inside]) < 1e-5
+    assert (wanted < 0).sum() > 3
+    np.testing.assert_allclose(distance(probe, shape), wanted, atol=1e-5)
 
 
 def test_bounds_touch_the_surface_on_every_side():
-    kinds, size, position, rotation, shape = posed_union(7)
-    skin = [surface_samples(kind, size[k]) @ rotation[k].T + position[k] for k, kind in enumerate(kinds)]
-    skin = np.concatenate(skin)
-    np.testing.assert_allclose(sdf.bounds(shape), [skin.min(0), skin.max(0)], atol=2e-4)
-    assert np.all(sdf.bounds(shape)[0] <= skin.min(0) + 1e-7) and np.all(sdf.bounds(shape)[1] >= skin.max(0) - 1e-7)
-    only = dataclasses.replace(shape, active=jnp.array([False, False, True, False]))
-    ellipsoid = surface_samples("ellipsoid", size[2]) @ rotation[2].T + position[2]
-    np.testing.assert_allclose(sdf.bounds(only), [ellipsoid.min(0), ellipsoid.max(0)], atol=2e-4)
+    shape = posed_union(7)[-1]
+    for active in ([True, True, True, False], [False, False, True, False]):
+        own = dataclasses.replace(shape, active=jnp.array(active))
+        bounds = sdf.bounds(own)
+        for axis in range(3):
+            for side in range(2):
+                plane = np.stack(np.meshgrid(*np.linspace(*np.delete(bounds, axis, 1), 400).T), -1).reshape(-1, 2)
+                gap = distance(np.insert(plane, axis, bounds[side, axis], 1).astype(np.float32), own)
+                assert -1e-6 <= float(gap.min()) < 3e-4, "points are up to 0.4 mm apart"
     with pytest.raises(ConfigError, match="no active primitive"):
         sdf.bounds(dataclasses.replace(shape, active=jnp.zeros(4, bool)))
 

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from shapes import solid
 
-from dexsim.geometry import distance, grid, mesh, sdf, surface_points
+from dexsim.geometry import mesh, sdf, surface_points
 
 SIZES = {
     "sphere": (0.03, 0, 0),
@@ -17,12 +18,6 @@ SIZES = {
 }
 FEW = 300
 nearest = jax.jit(surface_points.nearest)
-
-
-def solid(kind, *size):
-    return sdf.Shape(
-        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
-    )
 
 
 def union():
@@ -58,14 +53,6 @@ def test_the_search_finds_the_nearest():
     np.testing.assert_array_equal(found[sure], wanted[sure, 0])
 
 
-def test_depth_is_the_offset_along_the_normal():
-    """By hand: one point at the origin that looks up."""
-    surface = surface_points.SurfacePoints(jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]))
-    value, normal = surface_points.distance_and_normal(jnp.array([[0.01, 0, -0.002], [0.0, 0.03, 0.004]]), surface)
-    np.testing.assert_allclose(value, [-0.002, 0.004], atol=1e-9)
-    np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
-
-
 def test_sizes_may_be_traced_and_differ_between_environments():
     points = jnp.asarray(probes(solid("sphere", 0.03), 200))
 
@@ -91,24 +78,3 @@ def test_points_of_a_mesh():
     truth = np.linalg.norm(points, axis=1) - 0.03
     near = np.abs(truth) < 0.003
     assert np.abs(value - truth)[near].mean() < 2e-4
-
-
-# --- by name -------------------------------------------------------------------------------------
-
-
-def test_one_signature_for_all():
-    shape = solid("sphere", 0.03)
-    points = probes(shape, 500)
-    truth = np.linalg.norm(points, axis=1) - 0.03
-    near = np.abs(truth) < 0.003
-    for name, bound, geometry in (
-        ("closed_form", 1e-7, shape),
-        ("grid", 1.5e-5, grid.bake(shape)),
-        ("surface_points", 2e-4, surface_points.from_shape(shape)),
-    ):
-        assert name in distance.METHODS
-        value, normal = jax.jit(distance.distance_and_normal)(points, geometry)
-        np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, geometry), value)
-        assert np.abs(value - truth)[near].max() < bound
-        outward = points / np.linalg.norm(points, axis=1, keepdims=True)
-        assert np.sum(normal * outward, -1)[near].min() > 0.99

@@ -22,36 +22,31 @@ def own(tmp_path, monkeypatch):
     return "own/xhand_right.toml"
 
 
-def heavier(path, change=('mass="0.538515"', 'mass="0.6"')):
-    model = path.replace(".toml", ".xml")
-    with open(model) as file:
-        text = file.read()
-    with open(model, "w") as file:
-        file.write(text.replace(*change))
+def replace(path, old, new):
+    text = Path(path).read_text()
+    assert old in text
+    Path(path).write_text(text.replace(old, new))
+
+
+def heavier(path):
+    replace(path.replace(".toml", ".xml"), 'mass="0.538515"', 'mass="0.6"')
 
 
 def test_default_hand_has_no_record(hand):
     assert record_of(hand) is None and recorded_hand(None, "", "x") is None
     assert load_hand("xhand_right").source == hand.source == "xhand_right"
-
-
-def test_unknown_name_is_one_line():
     with pytest.raises(AssetError, match="hand 'nohand': no such file, and no shipped hand has that name"):
         load_hand("nohand")
 
 
-@pytest.mark.parametrize("quote", ['"', "'"])
-def test_the_hash_has_what_the_included_files_include(own, quote):
+def test_the_hash_has_what_the_included_files_include(own):
     """MuJoCo finds those beside the model, or beside the file that includes them."""
     own = Path(own).resolve()  # MuJoCo misses the file of a file where the model's path is relative
     folder = own.parent
     (folder / "parts").mkdir()
-    model = (folder / "xhand_right.xml").read_text()
-    begin = model.index("<mujoco")
-    end = model.index(">", begin) + 1
-    (folder / "xhand_right.xml").write_text(f"{model[:end]}<include file={quote}parts/a.xml{quote}/>{model[end:]}")
+    replace(folder / "xhand_right.xml", "<worldbody>", "<include file='parts/a.xml'/><worldbody>")
     for place in (folder / "parts/b.xml", folder / "b.xml"):
-        (folder / "parts/a.xml").write_text(f"<mujoco><include file={quote}b.xml{quote}/></mujoco>")
+        (folder / "parts/a.xml").write_text("<mujoco><include file='b.xml'/></mujoco>")
         place.write_text("<mujoco><custom><numeric name='x' data='1'/></custom></mujoco>")
         before = load_hand(own).digest
         place.write_text("<mujoco><custom><numeric name='x' data='2'/></custom></mujoco>")
@@ -82,14 +77,8 @@ def test_changed_files_are_refused_or_warned_of(own):
 
 
 def test_another_hand_is_refused(own):
-    with open(own) as file:
-        text = file.read()
-    with open(own, "w") as file:
-        file.write(text.replace('name = "pinky"\n', 'name = "little"\n'))
-    with open("own/taxels.csv") as file:
-        rows = file.read()
-    with open("own/taxels.csv", "w") as file:
-        file.write(rows.replace("pinky,", "little,"))
+    replace(own, 'name = "pinky"\n', 'name = "little"\n')
+    replace("own/taxels.csv", "pinky,", "little,")
     with pytest.raises(ConfigError, match="is of the hand 'xhand_right', not of 'own/xhand_right.toml'"):
         load_policy("grasp").find_hand(own)
 

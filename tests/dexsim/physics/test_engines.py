@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import GRAVITY, row, rows_of, squeeze, stack
+from two_fingers import write
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError
@@ -130,32 +131,14 @@ MJCF = """
   <equality><joint name="couple" joint1="a_next" joint2="a" polycoef="0 0.7 0 0 0"/></equality>
 </mujoco>
 """
-TOML = """
-model = "two.xml"
-taxels = "two.csv"
-taxel_grid = [1, 1]
-palm = "base"
-joints = ["a", "b"]
-speed_limits = [8, 8]
-[[fingers]]
-name = "a"
-tip = "a_tip"
-root_joint = "a"
-[[fingers]]
-name = "b"
-tip = "b_tip"
-root_joint = "b"
-"""
-CSV = "finger,column,row,x,y,z,nx,ny,nz,area\na,0,0,0,-.01,.025,0,-1,0,1e-5\nb,0,0,0,.01,.05,0,1,0,1e-5\n"
 
 
 @pytest.fixture(scope="module")
 def physics(tmp_path_factory):
     folder = tmp_path_factory.mktemp("two")
-    for name, text in (("two.xml", MJCF), ("two.csv", CSV), ("two.toml", TOML)):
-        (folder / name).write_text(text)
+    hand = load_hand(write(folder, MJCF, "a,0,0,0,-.01,.025,0,-1,0,1e-5\nb,0,0,0,.01,.05,0,1,0,1e-5\n"))
     size, config = np.float32([[0.02, 0.03, 0]]), PhysicsConfig(substeps=2)
-    return Physics(load_hand(folder / "two.toml"), ("capsule",), size, config, gravity=(9.81, 0, 0), backend="mjx")
+    return Physics(hand, ("capsule",), size, config, gravity=(9.81, 0, 0), backend="mjx")
 
 
 def test_gradients_in_a_pinch_are_finite_differences(physics):

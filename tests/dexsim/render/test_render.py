@@ -12,7 +12,7 @@ import pytest
 
 from dexsim.hand.load import load_hand
 from dexsim.render import picture, render
-from dexsim.render.panel import draw_panel, force_color, make_layout, read_outs, taxel_image
+from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
 from dexsim.render.raycast import FAR, Camera, Primitives, cast, hit_points, look, normals, project
 from dexsim.render.snapshot import Snapshot
 
@@ -62,18 +62,6 @@ def snapshot(hand, *, active="sphere", force=None):
         target_force=np.float32(3.0),
         finger_force=force.sum(1),
     )
-
-
-def test_camera_looks_at_its_target_with_gravity_down():
-    camera = Camera(azimuth=35, elevation=25, distance=0.7, target=(0.01, 0.02, 0.03), up=(-1, 0, 0))
-    view = look(camera, (200, 100))
-    pixel, depth = project(view, np.array([camera.target, np.array(camera.target) + [-0.05, 0, 0]]))
-    np.testing.assert_allclose(pixel[0], [100, 50], atol=1e-9)
-    np.testing.assert_allclose(depth[0], 0.7, atol=1e-12)
-    np.testing.assert_allclose(pixel[1, 0], 100, atol=1e-9)  # against gravity is straight up in the picture
-    assert pixel[1, 1] < 50
-    np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(view.axes) > 0
 
 
 def test_sphere_projects_where_the_pinhole_formula_says():
@@ -190,26 +178,10 @@ def test_a_loaded_taxel_shows_on_the_finger(hand):
     assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
 
 
-def test_frame_is_deterministic_and_both_cameras_work(hand):
-    one, two = (render.render_frame(hand, KINDS, snapshot(hand), size=SMALL) for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-    other = render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera="rotate")
-    assert np.any(other != one)
-    away = Camera(distance=0.3, target=(0.0, 0.0, 5.0), azimuth=180)  # the scene is behind it
-    assert render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera=away).shape == (240, 320, 3)
-
-
 def quarter(axis):
     """A quarter turn about an axis."""
     turn = np.roll(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), axis + 1, (0, 1))
     return turn
-
-
-def test_a_quarter_turn_of_a_cube_can_be_seen(hand):
-    cube = dataclasses.replace(snapshot(hand, active="box"), primitive_size=np.full((5, 3), 0.025, np.float32))
-    turned = dataclasses.replace(cube, object_rotation=quarter(0))
-    plain, other = (render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate") for s in (cube, turned))
-    assert np.any(plain != other, -1).mean() > 0.02
 
 
 def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
@@ -224,15 +196,6 @@ def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
     assert np.abs(frames[1] - frames[0]).max() > 60 and np.abs(frames[2] - frames[1]).max() > 60
 
 
-def test_a_picture_says_time_turns_command_and_forces(hand):
-    force = np.zeros(hand.taxel_position.shape[:2], np.float32)
-    force[1, 0] = 2.5
-    plain = snapshot(hand, force=force)
-    assert read_outs(plain) == {"command": "0.50", "target": "3.0 N", "total": "2.5 N"}
-    turning = dataclasses.replace(plain, turns=np.int32(7), seconds=np.float32(12.34))
-    assert read_outs(turning) == {"time": "12.3 s", "turns": "7", "total": "2.5 N"}
-
-
 def episode(hand, length):
     force = np.zeros(hand.taxel_position.shape[:2], np.float32)
     force[1, 30:60] = 0.2
@@ -243,20 +206,6 @@ def episode(hand, length):
         steps[-1].object_position[0] += 0.002 * t
     env = SimpleNamespace(name="grasp", hand=hand, primitive_kinds=KINDS)
     return env, jax.tree.map(lambda *x: np.stack(x), *steps)
-
-
-def test_gif_is_written_and_readable(hand, tmp_path, monkeypatch):
-    from PIL import Image
-
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if not installed
-    env, steps = episode(hand, 6)
-    path = render.render_episode(env, steps, tmp_path / "new" / "video.mp4", fps=20, size=SMALL)
-    assert path == tmp_path / "new" / "video.gif" and path.is_file()
-    with Image.open(path) as image:
-        assert image.size == SMALL and image.n_frames == 6 and image.info["duration"] == 50
-        # The heat of the last frame survives the palette.
-        image.seek(5)
-        assert (np.asarray(image.convert("RGB")).astype(int) @ [2, 0, -1]).max() > 250
 
 
 def test_mp4_is_written_and_readable(hand, tmp_path):
@@ -279,10 +228,11 @@ def test_mp4_is_written_and_readable(hand, tmp_path):
 def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
     from PIL import Image
 
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if not installed
     env, steps = episode(hand, 9)
     for rate, frames, duration in ((10, 3, 100), (60, 18, 20)):
-        path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), rate=rate)
+        path = render.render_episode(env, steps, tmp_path / "new" / "video.mp4", fps=30, size=(160, 120), rate=rate)
+        assert path == tmp_path / "new" / "video.gif"
         with Image.open(path) as image:
             assert image.n_frames <= frames and image.info["duration"] >= duration - 4
             total = sum(image.seek(k) or image.info["duration"] for k in range(image.n_frames))
@@ -290,22 +240,6 @@ def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
     empty = jax.tree.map(lambda x: x[:0], steps)
     with pytest.raises(ValueError, match="no snapshots"):
         render.render_episode(env, empty, tmp_path / "none.gif", fps=30)
-
-
-def test_notebook_figure_of_the_taxels(hand):
-    import matplotlib
-
-    matplotlib.use("agg")
-    force = np.zeros((5, 120), np.float32)
-    force[1, 3 * 12 + 7] = 0.5
-    figure = render.draw_taxels(hand, force)
-    maps = [axis for axis in figure.axes if axis.images]
-    assert [axis.get_title().split()[0] for axis in maps] == list(hand.finger_names)
-    image = maps[1].images[0]
-    left, right, bottom, top = image.get_extent()
-    row, column = np.unravel_index(np.argmax(image.get_array()), (12, 10))
-    assert column == 3 and 11 - row == 7 and (left, right, bottom, top) == (-0.5, 9.5, -0.5, 11.5)
-    figure.canvas.draw()
 
 
 def test_rendering_needs_no_opengl_and_no_pyplot():
@@ -318,15 +252,11 @@ def test_rendering_needs_no_opengl_and_no_pyplot():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-@pytest.mark.parametrize("fails", [0, 2], ids=["at once", "later"])
-def test_a_film_that_fails_leaves_the_one_before_it(fails, hand, tmp_path, monkeypatch):
+def test_a_film_that_fails_leaves_the_one_before_it(hand, tmp_path, monkeypatch):
     ffmpeg, path = pytest.importorskip("imageio_ffmpeg"), tmp_path / "video.mp4"
     path.write_text("the one before it")
     env, steps = episode(hand, 3)
-    if fails:
-        monkeypatch.setattr(ffmpeg, "write_frames", truncated)
-    else:
-        monkeypatch.setattr(render.tempfile, "tempdir", "/proc")
+    monkeypatch.setattr(ffmpeg, "write_frames", truncated)
     with pytest.raises(OSError) as error:
         render.render_episode(env, steps, path, fps=20, size=(160, 120))
     assert "\n" not in str(error.value) and path.read_text() == "the one before it"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -19,9 +20,8 @@ from dexsim.objects.config import KINDS
 from dexsim.render.picture import Pose
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.view.__main__ import ViewArguments, open_source
-from dexsim.view.policies import NONE, PolicyShelf
-from dexsim.view.scene import force_arrows, primitive
-from dexsim.view.simulation import Simulation
+from dexsim.view.scene import force_arrows
+from dexsim.view.simulation import NONE, PolicyShelf, Simulation
 from dexsim_ppo import load_policy
 
 VALUES = {"policy": "grasp", "object": "any", "command": 0.5, "friction factor": 1.0, "push [m/s]": 0.0, "push": False}
@@ -48,20 +48,6 @@ def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
     np.testing.assert_allclose(np.linalg.norm(head - longer), 2 * np.linalg.norm(head - tail), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("kind", "size", "half"),
-    [
-        ("box", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
-        ("capsule", (0.01, 0.02, 0), (0.01, 0.01, 0.03)),
-        ("cylinder", (0.01, 0.02, 0), (0.01, 0.01, 0.02)),
-        ("sphere", (0.01, 0, 0), (0.01, 0.01, 0.01)),
-        ("ellipsoid", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
-    ],
-)
-def test_primitives_have_their_size(kind, size, half):
-    np.testing.assert_allclose(primitive(kind, np.array(size)).bounds, [-np.array(half), half], rtol=0.02)
-
-
 # --- policies -------------------------------------------------------------------------------------------
 
 
@@ -77,17 +63,10 @@ def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_
     assert shelf.names() == ("grasp", str(file), NONE), "the policy of another observation is not offered"
     assert shelf.get(str(file)).training == grasp.training
     dataclasses.replace(grasp, training={"steps": 1}).save(file)
-    set_back(file, 5)
+    os.utime(file, (time.time() - 5,) * 2)  # also where the clock of the file system is coarse
     assert shelf.get(str(file)).training == {"steps": 1}
     file.write_bytes(b"half a file")
     assert shelf.get(str(file)).training == {"steps": 1}, "a damaged file keeps the last sound policy"
-
-
-def set_back(file, seconds):
-    """Another time of change, also where the clock of the file system is coarse."""
-    import os
-
-    os.utime(file, (time.time() - seconds,) * 2)
 
 
 # --- sources --------------------------------------------------------------------------------------------
@@ -160,12 +139,14 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
 def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
     made = []
     monkeypatch.setattr("dexsim.registry.make", lambda task, hand: made.append((task, hand.name)))
-    monkeypatch.setattr("dexsim.view.policies.PolicyShelf", lambda env, first: made.append(first))
+    monkeypatch.setattr("dexsim.view.simulation.PolicyShelf", lambda env, first: made.append(first))
     monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
     open_source(ViewArguments(what="grasp", hand="inspire_like"))
     assert made == [("grasp", "inspire_like"), NONE]
     with pytest.raises(AssetError, match="no shipped hand has that name"):
         open_source(ViewArguments(what="grasp", hand="no_such_hand"))
+    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
+        open_source(ViewArguments(what="no_such_thing"))
 
 
 @pytest.mark.slow
@@ -201,11 +182,6 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
     assert frames[0].kinds == () and source.controls()["go to [s]"].high == pytest.approx(0.6, abs=0.2)
     late = source.reset({"go to [s]": 0.3}).snapshot
     assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
-
-
-def test_what_is_nothing_is_refused_in_one_line():
-    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
-        open_source(ViewArguments(what="no_such_thing"))
 
 
 def test_view_names_the_missing_extra_before_it_imports_jax():
