@@ -153,6 +153,8 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
 
 _SINGLES = ("friction", "value_max", "force_max")
 _PAIRS = tuple(field.name for field in dataclasses.fields(Side) if field.name not in _SINGLES)
+_TEXTS = ("hand", "serial", "handedness", "created")
+_OTHERS = ("format", "version", "current_per_count", "finger_names", "force_per_count", "notes", "joint", "end")
 _FORCE_PER_TORQUE = ("force_per_torque", "force_per_torque_low", "force_per_torque_high")
 
 
@@ -161,7 +163,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
     lines = [
         f"format = {_text(FORMAT)}",
         f"version = {VERSION}",
-        *(f"{name} = {_text(getattr(calibration, name))}" for name in ("hand", "serial", "handedness", "created")),
+        *(f"{name} = {_text(getattr(calibration, name))}" for name in _TEXTS),
         f"current_per_count = {_numbers(calibration.current_per_count)}  # A",
         f"finger_names = {_text(calibration.finger_names)}",
         f"force_per_count = {_numbers(calibration.force_per_count)}  # N",
@@ -235,11 +237,15 @@ def _calibration(table: dict[str, Any]) -> Calibration:
     if table["end"] != {"complete": True}:
         raise ValueError("its end is missing")
     joints, fingers = table["joint"], tuple(map(str, table["finger_names"]))
+    _refuse_unknown(table, *_TEXTS, *_OTHERS, *_FORCE_PER_TORQUE)
     force_per_torque = None
     if "force_per_torque" in table:
         force_per_torque = np.array([_row(table, name, len(fingers)) for name in _FORCE_PER_TORQUE])
 
     def side(key: str) -> Side:
+        for joint in joints:
+            _refuse_unknown(joint, "name", "torque_scale", "real", "sim")
+            _refuse_unknown(joint[key], *_PAIRS, *_SINGLES)
         pairs = {name: np.stack([_row(joint[key], name, 2) for joint in joints], -1) for name in _PAIRS}
         singles = {name: np.concatenate([_row(joint[key], name, 1) for joint in joints]) for name in _SINGLES}
         return Side(**pairs, **singles)
@@ -259,6 +265,11 @@ def _calibration(table: dict[str, Any]) -> Calibration:
         notes=tuple(map(str, table["notes"])),
         force_per_torque=force_per_torque,
     )
+
+
+def _refuse_unknown(table: dict[str, Any], *known: str) -> None:
+    if unknown := set(table) - set(known):
+        raise ValueError(f"unknown entry {min(unknown)!r}")
 
 
 def _row(table: dict[str, Any], name: str, count: int) -> np.ndarray:
