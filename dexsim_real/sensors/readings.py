@@ -25,11 +25,7 @@ class ObjectEstimate:
 
 
 def sources_of(names: Sequence[str]) -> set[str]:
-    """The sensors ("hand", "camera", "imu", ...) that an observation with these fields needs.
-
-    Raises:
-      HandError: no sensor of the bridge measures a field.
-    """
+    """The sensors ("hand", "camera", "imu", ...) for these observation fields. HandError: none measures one of them."""
     for name in names:
         if name not in FIELDS or FIELDS[name].source not in SOURCES:
             raise HandError(

@@ -92,7 +92,7 @@ def test_a_run_takes_an_exported_policy(tmp_path, monkeypatch):
 
     from dexsim_real.run import __main__ as run
 
-    monkeypatch.setattr("dexsim_real.run.result.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
     export.main(["grasp", "--output", str(tmp_path / "grasp.npz")])
     with FollowingHand() as peer:
         _, *others = arguments(peer, tmp_path, "--seconds", "0.5")
