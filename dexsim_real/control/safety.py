@@ -240,11 +240,10 @@ class Safety:
         self._time = self._on = now
         self._held, self._eased = 0.0, None
         self._restart(now)
-        self._ramp_start = now + _SOFT
 
     def _restart(self, now: float) -> None:
-        """Continue from the last command, slowly at first."""
-        self._holding, self._ramp_start = False, now
+        """Continue from the last command, slowly at first; a hold does not shorten the start of the motors."""
+        self._holding, self._ramp_start = False, max(now, self._on + _SOFT)
         self.anchor += 1
 
     def _turn_off(self, now: float, reason: str, seconds: float) -> SafetyDecision:

@@ -106,6 +106,15 @@ def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
     np.testing.assert_allclose(path[-1], MIDDLE + 0.15, atol=1e-6)
 
 
+def test_a_hold_does_not_shorten_the_start(hand):
+    bench = Bench(hand)
+    bench.engage()
+    path = [d.position for d in bench.run(0.1, target=MIDDLE + np.float32(0.5) * FREE)]
+    path += [d.position for d in bench.run(0.05, target=MIDDLE, hold=UNSEEN)]
+    path += [d.position for d in bench.run(0.3, target=MIDDLE + np.float32(0.5) * FREE)]
+    assert 0.4 < np.abs(np.diff(path, axis=0)).max() / CYCLE <= 0.5
+
+
 def test_a_target_of_before_the_motors_came_on_moves_nothing(hand):
     bench = Bench(hand)
     bench.run(0.15, target=MIDDLE + np.float32(0.1) * FREE)
