@@ -28,13 +28,7 @@ _OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
 
 
 class Replay:
-    """A log that is recomputed record by record.
-
-    Args:
-      path: of the log.
-      meta: configuration of the run.
-      hand: see `replay`.
-    """
+    """A log that is recomputed record by record; `meta` is the configuration of the run."""
 
     def __init__(self, path: Path, meta: dict[str, Any], hand: str):
         if options := _OTHERS.get(str(meta.get("task"))):

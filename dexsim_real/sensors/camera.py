@@ -87,12 +87,8 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
 class HeightSensor:
     """Tracks the object from its own thread.
 
-    Args:
-      masks: source of masks.
-      config: of the camera.
-      reference: [3] m, the object's coordinates that are not measured.
-      axes: which coordinates are measured (`Sensing.object_axes`): exactly one, else HandError.
-      weight: of the newest difference in the velocity (`Sensing.velocity_filter`).
+    `axes` tells which coordinate is measured (`Sensing.object_axes`): exactly one, else HandError. The others are those
+    of `reference` [3] m. `weight` is of the newest difference in the velocity (`Sensing.velocity_filter`).
     """
 
     def __init__(

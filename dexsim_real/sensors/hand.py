@@ -97,15 +97,8 @@ def check_wire(hand: Hand) -> None:
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
 
-    `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one.
-
-    Args:
-      hand: model of the hand.
-      config: signs, scales and gains.
-      calibration: of this hand; None uses the scales of `config`.
-
-    Raises:
-      HandError: the model has other joints or taxels than the frames.
+    `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one. Without
+    a calibration of this hand the scales of `config` count. HandError: the model has other joints or taxels.
     """
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
@@ -143,16 +136,10 @@ class HandSensing:
         )
 
     def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:
-        """Tare the taxels: their mean counts over these states read as no force from now on. Mask stuck ones.
+        """Tare the taxels: their mean counts over these `frames.STATE_BLOCK`s of an untouched hand read as no force.
 
-        Args:
-          states: `frames.STATE_BLOCK` of an untouched hand.
-
-        Returns:
-          One line for each fingertip with stuck taxels.
-
-        Raises:
-          HandError: a fingertip touches something, or has many stuck taxels.
+        Stuck taxels are masked; returns a line for each fingertip with some. Raises HandError: a fingertip touches
+        something, or has many stuck taxels.
         """
         counts = np.asarray(np.mean([self.counts(state) for state in states], axis=0, dtype=np.float32))
         stuck = judge_rest(self.hand, counts, self.config.tare_sum)
@@ -163,13 +150,8 @@ class HandSensing:
     def follow_taxels(self, time: float, state: np.ndarray, limit: float) -> tuple[bool, list[str]]:
         """Mask taxels that have got stuck and follow the zeros of those that touch nothing, by every answer of a run.
 
-        Args:
-          time: s of the answer.
-          state: a `frames.STATE_BLOCK`.
-          limit: N, the largest force of a finger.
-
-        Returns:
-          Whether `tare` has changed, and lines about masked taxels and zeros that have moved far.
+        `limit` N is the largest force of a finger. Returns whether `tare` has changed, and lines about masked taxels
+        and zeros that have moved far.
         """
         before, lines, counts = self.tare, list[str](), self.counts(state)
         stuck = self._stuck.find(np.maximum(counts - before, 0.0), limit / self._per_count)
@@ -201,13 +183,8 @@ class HandSensing:
     def command(self, position: np.ndarray, mode: Mode, stiffness: float = 1.0) -> np.ndarray:
         """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.
 
-        Args:
-          position: [J] rad.
-          mode: of all joints.
-          stiffness: share of the gains kp and ki in [0, 1]; those of damping are always whole.
-
-        Raises:
-          HandError: an angle is not finite.
+        `stiffness` is a share of the gains kp and ki in [0, 1]; those of damping are always whole. Raises HandError: an
+        angle is not finite.
         """
         config, on = self.config, mode == Mode.POSITION
         block = frames.command_block(

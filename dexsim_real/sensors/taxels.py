@@ -23,18 +23,10 @@ _AT_ONCE = 10.0  # counts of rise that may have been saved up while the fingerti
 
 
 def judge_rest(hand: Hand, counts: np.ndarray, most: float) -> np.ndarray:
-    """Judge fingertips that should touch nothing.
+    """Mask [F, N] of stuck taxels, given mean raw counts [F, N] of fingertips that should touch nothing.
 
-    Args:
-      hand: names, and the lattice of the taxels.
-      counts: [F, N] mean raw counts.
-      most: sum of a fingertip's counts above which it is touched; stuck taxels, which are masked, do not add to it.
-
-    Returns:
-      Mask [F, N] of stuck taxels.
-
-    Raises:
-      HandError: something touches a fingertip, or many of its taxels are stuck.
+    `most` is the sum of a fingertip's counts above which it is touched; stuck taxels do not add to it. Raises
+    HandError: something touches a fingertip, or many of its taxels are stuck.
     """
     high = counts > _HIGH
     beside = around(hand, high.astype(np.float32)).sum(0)
@@ -86,12 +78,7 @@ class StuckTaxels:
         self._answers = np.zeros(self._first.shape, int)
 
     def find(self, counts: np.ndarray, limit: np.ndarray) -> np.ndarray:
-        """Update with tared counts [F, N] of an answer; returns the mask [F, N] of stuck taxels.
-
-        Args:
-          counts: 0 where a taxel reads no force.
-          limit: [F, 1] counts that a finger may read.
-        """
+        """Mask [F, N] of stuck taxels, given each answer's tared counts [F, N] and what a finger may read [F, 1]."""
         same = (counts > limit) & (np.abs(counts - self._first) <= _SAME)
         self._first = np.where(same, self._first, counts)
         others = np.where(same, 0.0, counts).max(1, keepdims=True)
@@ -103,11 +90,8 @@ class ZeroTracker:
     """Follows the zeros of a run's taxels, which wander over minutes, as the fingertips warm up.
 
     What a free taxel reads on average is its new zero. Light touches look the same to a single taxel, so the zeros of a
-    fingertip rise together no faster than they wander with temperature, and all that is taken for zero is bounded.
-
-    Args:
-      hand: the lattice of the taxels.
-      most: counts that the zeros of a fingertip may reach together: the largest load that they can hide.
+    fingertip rise together no faster than they wander with temperature, and to `most` counts: the largest load that
+    they can hide.
     """
 
     def __init__(self, hand: Hand, most: float):
