@@ -169,14 +169,6 @@ def until_off(bench, read, seconds=10.0, **fields):
     return None
 
 
-def test_encoders_that_are_frozen_are_noticed_within_a_second(bench):
-    frozen = bench.position.copy()
-    assert until_off(bench, lambda true: frozen) < 1.0
-    for _ in range(round(0.3 / CYCLE)):
-        cycle(bench, wave(bench), read=frozen)
-    assert bench.safety.latched.startswith(("no joint angle changes while the commands move", "joint"))
-
-
 def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench):
     """The hand squeezes, or its currents are frozen, too."""
     frozen, start = bench.position.copy(), bench.now

@@ -139,17 +139,6 @@ def test_a_picture_of_another_clock_does_not_stay_young(when):
     sensor.close()
 
 
-def test_a_stream_of_something_else(tmp_path):
-    for name, head in (("a", b"PICT" + bytes(12)), ("b", b"MASK" + b"\xff" * 12)):
-        server = socket.socket(socket.AF_UNIX)
-        server.bind(str(tmp_path / name))
-        server.listen()
-        read = open_masks(f"unix:{tmp_path / name}", CameraConfig())
-        server.accept()[0].sendall(head)
-        with pytest.raises(HandError, match="invalid mask frame"):
-            read()
-
-
 def test_the_colour_threshold():
     cv2 = pytest.importorskip("cv2")
     config = CameraConfig()

@@ -163,18 +163,6 @@ def test_damage_costs_only_the_damaged_frames(seed, end):
     assert received + parser.expire() == sent and parser.counts.received == fed
 
 
-@settings(max_examples=60)
-@given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from(HEADS)), max_size=40), st.integers(1, 20))
-def test_noise_alone_is_nothing_and_hides_nothing(parts, size):
-    noise = b"".join(parts)
-    sent = Frame(0x80, 0xFE, Command.VERSION, b"1.3.9")
-    parser = Parser(HAND_REPLIES)
-    stream = noise + sent.encode()
-    got = [frame for i in range(0, len(stream), size) for frame in parser.feed(stream[i : i + size])]
-    assert got + parser.expire() == [sent]
-    assert parser.pending == 0 and parser.counts.skipped == len(noise)
-
-
 def test_the_worst_stream_costs_bounded_work():
     # Nothing but believable headers: each asks for a checksum over a whole frame.
     stream = bytes.fromhex("55AA80FE02A008") * 6000
