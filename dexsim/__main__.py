@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from dexsim.core import cli
+from dexsim.core.door import begin_loading, end_loading
 from dexsim.core.errors import ConfigError
 
 COMMANDS = {
@@ -48,7 +49,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
     if name == "train":
         cli.announce(cli.LOADING)
-    return importlib.import_module(COMMANDS[name][0]).main(rest)
+    begin_loading()
+    module = importlib.import_module(COMMANDS[name][0])
+    end_loading()
+    return module.main(rest)
 
 
 def console() -> None:

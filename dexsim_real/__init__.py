@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dexsim_real.control.limits import SafetyConfig
     from dexsim_real.control.safety import Safety
     from dexsim_real.core.errors import HandError
-    from dexsim_real.run.result import RunResult, run_policy
+    from dexsim_real.run.session import RunResult, run_policy
     from dexsim_real.wire.link import HandPort, LinkConfig
     from dexsim_real.wire.serial_hand import SerialHand, open_port
 
@@ -38,11 +38,11 @@ __getattr__, __dir__ = open_door(
         "HandError": "dexsim_real.core.errors",
         "HandPort": "dexsim_real.wire.link",
         "LinkConfig": "dexsim_real.wire.link",
-        "RunResult": "dexsim_real.run.result",
+        "RunResult": "dexsim_real.run.session",
         "Safety": "dexsim_real.control.safety",
         "SafetyConfig": "dexsim_real.control.limits",
         "SerialHand": "dexsim_real.wire.serial_hand",
         "open_port": "dexsim_real.wire.serial_hand",
-        "run_policy": "dexsim_real.run.result",
+        "run_policy": "dexsim_real.run.session",
     },
 )

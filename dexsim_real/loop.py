@@ -1,19 +1,18 @@
 """The exchange loop with a hand: decide, send, sense, judge.
 
-There is one. A run on a hand is this loop in a thread of its own (`LoopThread`), a calibration steps it from its
-procedure (`calibrate.bench`), and a run in virtual time gives it a port whose waiting
-passes the time (`twin.virtual`).
+A run on a hand is this loop in a thread of its own (`LoopThread`), a calibration steps it from its procedure
+(`calibrate.bench`), and a run in virtual time gives it a port whose waiting passes the time (`twin.virtual`).
 """
 
 import contextlib
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dexsim_real.control.motors_off import patience, turn_off
+from dexsim_real.control.motors_off import BRIEF, PATIENCE, turn_off
 from dexsim_real.control.safety import HandSample, Safety, SafetyDecision
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import ignore_signals, raise_priority
@@ -38,13 +37,10 @@ class Exchange(NamedTuple):
 class ExchangeLoop:
     """Exchanges commands and states with a hand, one `cycle` at a time.
 
-    `retared` is called with the number of the exchange from which on another tare holds, and with lines that name
-    taxels which it masks.
+    `retared` is called with the number of the exchange from which on another tare may hold, and with lines about it.
 
     Args:
       port: connected; used by this loop only.
-      sensing: conversion to SI units.
-      safety: decides the commands.
       rate: exchanges per second.
       beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
       track_taxels: follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured.
@@ -69,7 +65,7 @@ class ExchangeLoop:
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self.track_taxels = track_taxels
-        self._filter = VelocityFilter(sensing.config.velocity_time)
+        self._filter = VelocityFilter()
         self._generation: int | None = None
         self._engage = False
 
@@ -109,8 +105,7 @@ class ExchangeLoop:
     def tare(self) -> list[str]:
         """Tare the taxels with the motors off; returns a line for each fingertip with stuck taxels.
 
-        Raises:
-          HandError: the hand does not answer or refuses, or a fingertip touches something.
+        Raises HandError: the hand does not answer or refuses, or a fingertip touches something.
         """
         states, until = list[np.ndarray](), self.clock() + _TARE
         tracked, self.track_taxels = self.track_taxels, False  # Untared, a zero is a touch.
@@ -134,10 +129,10 @@ class ExchangeLoop:
         if self._closed:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
-        self._closed = True
-        self._beat(patience(self.driven))
+        self._closed, seconds = True, PATIENCE if self.driven else BRIEF
+        self._beat(seconds)
         try:
-            if turn_off(self.port, off, patience(self.driven)):
+            if turn_off(self.port, off, seconds):
                 self.driven = False
         finally:
             with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
@@ -145,36 +140,27 @@ class ExchangeLoop:
 
     def _sample(self, reply: Reply) -> HandSample:
         if self.track_taxels:
-            lines = self.sensing.mask_stuck(reply.state, self.safety.config.finger_force)
-            if self.sensing.track_zero(reply.received, reply.state) or lines:
+            limit = self.safety.config.finger_force
+            changed, lines = self.sensing.follow_taxels(reply.received, reply.state, limit)
+            if changed or lines:
                 self.retared(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
         if reply.generation != self._generation:
             self._filter.reset()
         self._generation = reply.generation
-        velocity = self.sensing.velocity(reply.state)
-        if velocity is None:
-            velocity = self._filter.estimate(reply.received, measured.joint_position)
+        velocity = self._filter.estimate(reply.received, measured.joint_position)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
 
 
 class LoopThread(ExchangeLoop):
-    """The exchange loop in a thread, at absolute deadlines until stopped.
+    """The exchange loop in a thread, at absolute deadlines until stopped; made as `ExchangeLoop` is.
 
     The policy runs in another thread at a lower rate. If it dies, this thread continues and `Safety` reacts. Whatever
     ends this thread, it turns the motors off.
     """
 
-    def __init__(
-        self,
-        port: HandPort,
-        sensing: HandSensing,
-        safety: Safety,
-        rate: float,
-        beat: Callable[[float], None] = lambda more: None,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        super().__init__(port, sensing, safety, rate, beat, clock=clock)
+    def __init__(self, *parts: Any, **options: Any):
+        super().__init__(*parts, **options)
         self.error: BaseException | None = None
         self._stop, self._fresh = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="exchange", daemon=True)

@@ -219,6 +219,7 @@ def _calibration(table: dict[str, Any]) -> Calibration:
         raise ValueError(f"it has version {table['version']!r:.20}, this library reads {VERSION}")
     if table["end"] != {"complete": True}:
         raise ValueError("its end is missing")
+    _refuse_unknown(table, "format", "version", *_WORDS, *_UNITS, "real", "sim", "end")
     words: dict[str, Any] = {
         name: tuple(map(str, v)) if isinstance(v := table[name], list) else str(v) for name in _WORDS
     }
@@ -232,6 +233,7 @@ def _calibration(table: dict[str, Any]) -> Calibration:
 
     def side(part: dict[str, Any]) -> Side:
         names = [field.name for field in dataclasses.fields(Side)]
+        _refuse_unknown(part, *names)
         shapes = {name: (joints,) if name in _ONE_A_JOINT else (2, joints) for name in names}
         return Side(**{name: numbers(part, name, *shape) for name, shape in shapes.items()})
 
@@ -244,6 +246,11 @@ def _calibration(table: dict[str, Any]) -> Calibration:
         current_per_count=float(table["current_per_count"]),
         **words,
     )
+
+
+def _refuse_unknown(table: dict[str, Any], *known: str) -> None:
+    if unknown := set(table) - set(known):
+        raise ValueError(f"unknown entry {min(unknown)!r}")
 
 
 # --- what no hand gives -----------------------------------------------------------------------

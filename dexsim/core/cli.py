@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
+from dexsim.core.door import end_loading
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import is_device, make_private, write_whole
 from dexsim.core.install import DISTRIBUTION
@@ -27,6 +28,7 @@ LOADING = "loading JAX and MuJoCo"
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
     warnings.showwarning = _show_warning
+    end_loading()
     try:
         code = main(None)
     except DexsimError as error:

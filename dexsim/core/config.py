@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
+_LARGEST = 2**63 - 1  # of an integer in a checkpoint
 
 
 def setting(
@@ -85,8 +86,10 @@ def _check_values(metadata: Any, value: Any, where: str) -> None:
             raise ConfigError(f"{where} = {item!r:.80}: choose from {', '.join(map(str, choices))}")
         if isinstance(item, bool) or not isinstance(item, (int, float)):
             continue
-        if not math.isfinite(item):
+        if isinstance(item, float) and not math.isfinite(item):
             raise ConfigError(f"{where} = {item}: must be a finite number")
+        if isinstance(item, int) and high is None and item > _LARGEST:
+            raise ConfigError(f"{where} = {item:.10g}{unit}: must be at most {_LARGEST:.10g}{unit}")
         if (low is not None and item < low) or (high is not None and item > high):
             raise ConfigError(f"{where} = {item:.10g}{unit}: must be {_range_text(low, high)}{unit}")
 

@@ -10,7 +10,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.refusals import Refusal
+from dexsim_real.wire.link import Refusal
 
 _BOARDS = ("palm", "joint", "tip")
 _STILL = 0.05  # rad, motion below which a joint with high current is stalled
@@ -19,14 +19,19 @@ _MOVED = 0.2  # rad, motion of a command that changes some joint's angle
 _UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
 
 
+def finger_joints(hand: Hand, finger: int) -> list[int]:
+    """Joints from the palm to a fingertip."""
+    body, joints = int(hand.tip_body[finger]), list[int]()
+    while body >= 0:
+        joints += [int(hand.body_joint[body])] if hand.body_joint[body] >= 0 else []
+        body = int(hand.body_parent[body])
+    return list(dict.fromkeys(joints[::-1]))  # a motor may move two
+
+
 def joint_labels(hand: Hand) -> tuple[str, ...]:
     """Names of the joints for messages, with their fingers."""
-    finger_of: dict[int, str] = {}
-    for finger, body in zip(hand.finger_names, hand.tip_body, strict=True):
-        while body >= 0:
-            finger_of.setdefault(int(hand.body_joint[body]), finger)
-            body = hand.body_parent[body]
-    return tuple(f"joint {name} ({finger_of[joint]})" for joint, name in enumerate(hand.joint_names))
+    fingers = {joint: name for i, name in enumerate(hand.finger_names) for joint in finger_joints(hand, i)}
+    return tuple(f"joint {name} ({fingers[joint]})" for joint, name in enumerate(hand.joint_names))
 
 
 class _Timer:
@@ -42,12 +47,7 @@ class _Timer:
 
 
 class Alarms:
-    """Judges the answers of the hand in the order in which they arrive.
-
-    Args:
-      hand: names of joints and fingers.
-      config: limits.
-    """
+    """Judges the answers of the hand in the order in which they arrive."""
 
     def __init__(self, hand: Hand, config: SafetyConfig):
         self.config = config
@@ -67,13 +67,7 @@ class Alarms:
         self._serious = 0  # serious refusals in a row
 
     def see(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
-        """Judge an answer.
-
-        Args:
-          time: s of the answer.
-          measured: what it contains.
-          command: [J] rad; None with the motors off.
-        """
+        """Judge an answer at a time in s to a command [J] rad; None with the motors off."""
         self.refused, self._serious = "", 0
         sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
         waiting = (

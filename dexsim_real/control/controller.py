@@ -52,9 +52,8 @@ def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) 
 class Controller:
     """The policy between readings and joint targets.
 
-    Raises:
-      HandError: the policy observes what its task does not give or no sensor can measure, or gives another number of
-        actions than the hand has joints.
+    Raises HandError: the policy observes what its task does not give or no sensor can measure, or gives another number
+    of actions than the hand has joints.
     """
 
     def __init__(self, policy: Policy, hand: Hand):
@@ -108,14 +107,7 @@ class Controller:
         self.target = np.asarray(position, np.float32)
 
     def tick(self, measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
-        """Compute readings, observation, action and joint targets.
-
-        Args:
-          measured: of the hand.
-          estimate: of the object.
-          goal_quat: [4] goal orientation of the object.
-          command: grip command in [0, 1].
-        """
+        """Readings, observation, action and joint targets; `goal_quat` [4] of the object, grip command in [0, 1]."""
         self.actions = np.stack([self._recall(self.last_action, self.target), *self.actions[:2]])
         readings = make_readings(measured, estimate, goal_quat, command, self.actions)
         if self.spec.force_loop:

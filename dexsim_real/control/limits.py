@@ -2,18 +2,16 @@
 
 import dataclasses
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SafetyConfig:
+class SafetyConfig(Config):
     """Limits of the hand. Ages count from the time of the measurement or joint target."""
 
     margin: float = setting(0.03, unit="rad", low=0.0, high=0.5)
     """Distance of commands from the joints' end stops, at most half of a joint's range; motors that come on nearer to
     one begin there. What it cuts off a target does not count as a clip."""
-    beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
-    """Distance beyond a joint's limits at which a measured angle counts as wrong."""
     speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
     """Largest rate of change of a command, below the no-load speed of the slower joints (8.6 rad/s). A policy that
     changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s."""
@@ -53,6 +51,3 @@ class SafetyConfig:
     """Speed of commands right after the motors turn on or a hold ends, at most `speed`, to which it then grows."""
     ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
     """Time in which the speed of commands grows from `slow_speed` to `speed`."""
-
-    def __post_init__(self):
-        validate(self)

@@ -7,21 +7,15 @@ import numpy as np
 from dexsim_real.wire.link import HandPort, Reply
 
 UNCONFIRMED = "the hand did not confirm that its motors are off"
-PATIENCE = 5.0  # s for which a hand that was on and does not answer is told to turn its motors off
+PATIENCE = 5.0  # s for which a hand whose motors may be on and that does not answer is told to turn them off
+BRIEF = 0.3  # s, the same for a hand that was off already
 _PAUSE = 0.01  # s after an error of the port
-_BRIEF = 0.3  # s, the same for a hand that was off already
 
 
 def turn_off(port: HandPort, command: np.ndarray, seconds: float) -> bool:
-    """Send a command until the hand answers it; a port that fails is asked again.
+    """Send a command with all motors off until the hand answers it; a port that fails is asked again.
 
-    Args:
-      port: connected, or lost.
-      command: `frames.COMMAND_BLOCK` with all motors off.
-      seconds: s after which to give up.
-
-    Returns:
-      Whether the hand has confirmed it.
+    Gives up after so many `seconds`; returns whether the hand has confirmed it.
     """
     until = time.monotonic() + seconds
     while True:
@@ -32,8 +26,3 @@ def turn_off(port: HandPort, command: np.ndarray, seconds: float) -> bool:
             time.sleep(_PAUSE)
         if time.monotonic() > until:
             return False
-
-
-def patience(driven: bool) -> float:
-    """Time s to try: long for a hand whose motors may be on."""
-    return PATIENCE if driven else _BRIEF

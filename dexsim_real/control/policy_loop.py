@@ -5,19 +5,62 @@ in virtual time from its schedule.
 """
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from dexsim.task_spec import TurnSpec
 from dexsim_real.control.controller import Controller, Tick
-from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.imu import IDENTITY
+from dexsim_real.sensors.imu import IDENTITY, conjugate, multiply
 from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.sensors.readings import ObjectEstimate
 
 _PATIENCE = 60.0  # s to wait until the camera sees the object
+_SMOOTH = 0.1  # s, of the object's angular velocity
+
+
+class TurnGoals:
+    """Tracks the goals of the rotation task by the rules of the task.
+
+    The simulation uses the object's true angular velocity and position. Here the angular velocity is estimated from
+    the orientation (filtered over 0.1 s), and only the measured coordinate of the position counts. `reference` [3] m is
+    the nominal position of the object.
+    """
+
+    def __init__(self, turn: TurnSpec, reference: np.ndarray):
+        self._turn, self._reference = turn, np.asarray(reference)
+        self._axis = turn.unit_axis
+        self.successes, self.times = 0, list[float]()
+        self._last: tuple[float, np.ndarray] | None = None
+        self._spin = 0.0
+        self.quat = self._goal()
+
+    def update(self, time: float, estimate: ObjectEstimate) -> np.ndarray:
+        """Goal orientation [4] for an orientation at a time in s; the next one as soon as the last was reached."""
+        goal, quat = self._turn, estimate.quat
+        if self._last is not None and time > self._last[0]:
+            step = time - self._last[0]
+            turn = multiply(quat, conjugate(self._last[1]))
+            rate = 2 * math.atan2(float(turn[1:] @ self._axis), float(turn[0])) / step
+            rate = (rate + math.pi / step) % (2 * math.pi / step) - math.pi / step
+            self._spin += step / (step + _SMOOTH) * (rate - self._spin)
+        self._last = time, quat
+        away = 2 * math.acos(min(1.0, abs(float(quat @ self.quat))))
+        distance = np.linalg.norm(estimate.position - self._reference)
+        calm = goal.spin <= 0 or abs(self._spin) <= goal.spin
+        if away < goal.angle and distance < goal.distance and calm:
+            self.successes += 1
+            self.times.append(time)
+            self.quat = self._goal()
+        return self.quat
+
+    def _goal(self) -> np.ndarray:
+        angle = (self.successes + 1) * self._turn.step % (2 * math.pi)
+        return np.concatenate([[math.cos(angle / 2)], math.sin(angle / 2) * self._axis])
 
 
 def limits_for(config: SafetyConfig, controller: Controller) -> SafetyConfig:
@@ -37,8 +80,6 @@ class PolicyLoop:
 
     Args:
       controller: of the policy, warmed.
-      safety: gets the targets.
-      objects: camera and IMU.
       command: grip command in [0, 1].
       approach: s to move to the start posture; 0 stays at the measured pose.
       place: s in the start posture.
@@ -69,8 +110,7 @@ class PolicyLoop:
     def approach(self, now: float) -> bool:
         """Set the target of this time on the way to the start posture; False once the hand and the object are there.
 
-        Raises:
-          HandError: the camera does not see the object, or fails.
+        Raises HandError: the camera does not see the object, or fails.
         """
         if self._begin is None:
             # Where commands continue, not the last reading, which may be wrong.

@@ -13,6 +13,7 @@ import numpy as np
 from dexsim.hand.kinematics import Hand
 
 UNKNOWN = "the pose is not known: the last readings disagree, or are too few"
+_BEYOND = 0.1  # rad beyond a joint's limits up to which an angle is plausible
 _AGREEING = 10  # newest readings of a pose; fewer than half of them may be wrong by as much as they may differ
 _APART = 0.05  # rad, largest distance of these readings from their median
 _NOW = 5  # newest readings whose median is the pose of a hand that moves
@@ -22,16 +23,11 @@ _GAP = 0.03  # s, longest motion that an interval between two readings explains
 
 
 class PoseCheck:
-    """Judges measured joint angles, in the order in which they arrive.
+    """Judges measured joint angles, in the order in which they arrive."""
 
-    Args:
-      hand: limits, speeds and names of the joints.
-      beyond: rad outside the limits up to which an angle is plausible.
-    """
-
-    def __init__(self, hand: Hand, beyond: float):
+    def __init__(self, hand: Hand):
         self._names = hand.joint_names
-        self._lower, self._upper = hand.joint_lower - beyond, hand.joint_upper + beyond
+        self._lower, self._upper = hand.joint_lower - _BEYOND, hand.joint_upper + _BEYOND
         self._speed = _FASTER * hand.speed_limit
         self._time = self._known_time = 0.0  # s, of the last reading and of the last plausible one
         self._last: np.ndarray | None = None  # [J] rad, last plausible angles
@@ -65,12 +61,9 @@ class PoseCheck:
         self._recent.clear()
 
     def judge(self, time: float, position: np.ndarray, command: np.ndarray | None) -> str:
-        """Why a reading is wrong; empty for a plausible one.
+        """Why a finite reading [J] rad at a time in s is wrong; empty for a plausible one.
 
-        Args:
-          time: s of the reading.
-          position: [J] rad, finite.
-          command: [J] rad, to which the motors move now; None if they are off.
+        `command` [J] rad is to which the motors move now; None if they are off.
         """
         gap, self._time = max(time - self._time, 0.0), time
         outside = (position < self._lower) | (position > self._upper)

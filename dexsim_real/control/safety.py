@@ -25,7 +25,7 @@ from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.refusals import Refusal
+from dexsim_real.wire.link import Refusal
 
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
 _FORCE = "the fingertip force is too high"
@@ -81,12 +81,7 @@ class Safety:
     """Decides which command is sent.
 
     Not thread-safe: one thread calls `decide`, `see` and `engage`. Another may call `set_target`, which replaces one
-    tuple.
-
-    Args:
-      hand: joint limits.
-      config: the other limits.
-      note: called with one line whenever the reaction or its reason changes.
+    tuple. `note` is called with one line whenever the reaction or its reason changes.
     """
 
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
@@ -105,7 +100,7 @@ class Safety:
         self.anchor = 0  # number of times that commands restarted, after a hold or with the motors off before
         self.counts: Counter[str] = Counter()  # cycles by reason
         self._target: TargetRequest | None = None
-        self._pose = PoseCheck(hand, config.beyond)
+        self._pose = PoseCheck(hand)
         self._alarms = Alarms(hand, config)
         self._joints = joint_labels(hand)
         self._generation: int | None = None
@@ -150,18 +145,14 @@ class Safety:
         return True
 
     def refuse(self, refusal: Refusal | None) -> None:
-        """Update with an exchange that brought no state; None if the hand has not refused it."""
+        """Update with an exchange that brought no state; None if the hand has not refused the command."""
         if refusal is not None:
             self._alarms.refuse(refusal)
 
     def set_target(self, position: np.ndarray, time: float, hold_reason: str = "") -> None:
-        """Set the requested joint targets.
+        """Request joint targets [J] rad at a time in s.
 
-        Args:
-          position: [J] rad.
-          time: s of the request.
-          hold_reason: why the hand should hold instead of moving there, and the motors go off when it lasts; empty to
-            move.
+        `hold_reason` is why the hand should hold instead of moving there, and the motors go off when it lasts.
         """
         before = self._target
         since = before.since if before is not None and before.hold_reason else time
@@ -249,11 +240,10 @@ class Safety:
         self._time = self._on = now
         self._held, self._eased = 0.0, None
         self._restart(now)
-        self._ramp_start = now + _SOFT
 
     def _restart(self, now: float) -> None:
-        """Continue from the last command, slowly at first."""
-        self._holding, self._ramp_start = False, now
+        """Continue from the last command, slowly at first; a hold does not shorten the start of the motors."""
+        self._holding, self._ramp_start = False, max(now, self._on + _SOFT)
         self.anchor += 1
 
     def _turn_off(self, now: float, reason: str, seconds: float) -> SafetyDecision:

@@ -9,8 +9,8 @@ from pathlib import Path
 from dexsim.core.errors import DexsimError
 
 PORT_ERRORS = (OSError, ValueError, NotImplementedError, termios.error)
-"""What opening a serial port raises; the last, no `OSError`, when the port vanishes meanwhile, and the one before for a
-URL whose kind of port lacks a setting, such as rfc2217://."""
+"""What opening a serial port raises: `termios.error` when it vanishes meanwhile, `NotImplementedError` for a URL whose
+kind of port lacks a setting, such as rfc2217://."""
 
 
 class HandError(DexsimError):
@@ -28,20 +28,6 @@ def explain(port: str, error: Exception) -> str:
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: another program has it open (`fuser -v {port}` names it). Close that program first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        ports = sorted(str(link) for link in Path("/dev/serial/by-id").glob("*"))
-        known = f"choose from {', '.join(ports)}" if ports else "no serial port was found; check cable and power"
-        return f"{port}: there is no such port; {known}"
+        ports = ", ".join(sorted(str(link) for link in Path("/dev/serial/by-id").glob("*")))
+        return f"{port}: there is no such port; choose from: {ports or 'none found; check cable and power'}"
     return f"{port}: cannot be opened ({error}); check the name and the cable"
-
-
-def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices")) -> list[str]:
-    """Warn of an FTDI adapter whose latency timer exceeds 1 ms: at the usual 16 ms the loop runs at half its rate."""
-    timer = sysfs / os.path.basename(os.path.realpath(port)) / "latency_timer"
-    value = int(timer.read_text()) if timer.is_file() else 0
-    if value <= 1:
-        return []
-    return [
-        f"{port}: the adapter waits {value} ms before it forwards short packets. Set 1 ms now: "
-        f"`echo 1 | sudo tee {timer}`. Set it permanently in /etc/udev/rules.d/99-dexsim.rules: "
-        'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
-    ]

@@ -1,6 +1,6 @@
 """Run logs: append-only records, written by a background thread, readable after any crash.
 
-    DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
+    DXSLOG2\\n, then records: sync (4 bytes) | length | CRC-32 | msgpack of [kind, time, content]
 
 A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file is synced to
 the disk. A truncated or damaged record costs only itself.
@@ -25,10 +25,9 @@ import numpy as np
 from dexsim.core.errors import DexsimError
 from dexsim_real.core.process import lower_priority
 
-MAGIC = b"DXSLOG1\n"
+MAGIC = b"DXSLOG2\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
-_HEAD = struct.Struct("<4sBdII")
-_SEQUENCE = struct.Struct("<Q")
+_HEAD = struct.Struct("<4sII")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
@@ -49,9 +48,6 @@ class Kind(enum.IntEnum):
     TICK = 4  # readings, observation, action and joint target of one control tick
     NOTE = 5  # one line of text
     END = 6  # summary
-
-
-_KINDS = frozenset(Kind)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,14 +134,8 @@ class LogWriter:
 
 def encode(kind: Kind, when: float, content: Any) -> bytes:
     """The bytes of a record."""
-    if isinstance(content, tuple):
-        payload = _SEQUENCE.pack(content[0]) + content[1]
-    elif isinstance(content, str):
-        payload = content.encode()
-    else:
-        payload = msgpack.packb(content, default=_pack_array)
-    check = zlib.crc32(payload, zlib.crc32(_HEAD.pack(SYNC, kind, when, len(payload), 0)))
-    return _HEAD.pack(SYNC, kind, when, len(payload), check) + payload
+    payload = msgpack.packb([int(kind), when, content], default=_pack_array)
+    return _HEAD.pack(SYNC, len(payload), zlib.crc32(payload)) + payload
 
 
 class LogReader:
@@ -169,17 +159,18 @@ class LogReader:
         # A false head costs a checksum over all that it claims: without a bound a forged file would cost its square.
         left = _CHECKED * len(data) + _LONGEST
         while at < len(data):
-            record, size, checked = _decode(data, at)
-            left -= checked
+            payload = _payload(data, at)
+            left -= len(payload)
             if left < 0:
                 raise LogError(f"{self.path}: nearly all of it is damaged; record again")
+            record = _decode(data, at, payload)
             if record is None:
                 following = data.find(SYNC, at + 1)
                 following = len(data) if following < 0 else following
                 self.damaged += following - at
                 at = following
             else:
-                at += size
+                at += _HEAD.size + len(payload)
                 yield record
 
 
@@ -200,29 +191,23 @@ def reading(path: str | Path) -> Iterator[None]:
         ) from error
 
 
-def _decode(data: bytes, at: int) -> tuple[Record | None, int, int]:
-    """The record that begins here, its size, and the number of bytes under the checksum."""
-    if at + _HEAD.size > len(data):
-        return None, 0, 0
-    sync, kind, when, length, check = _HEAD.unpack_from(data, at)
+def _payload(data: bytes, at: int) -> bytes:
+    """What the head at this place claims; empty where there is none."""
+    if data[at : at + len(SYNC)] != SYNC or at + _HEAD.size > len(data):
+        return b""
+    _, length, _ = _HEAD.unpack_from(data, at)
     end = at + _HEAD.size + length
-    if sync != SYNC or length > _LONGEST or end > len(data) or kind not in _KINDS:
-        return None, 0, 0
-    payload = data[at + _HEAD.size : end]
-    if zlib.crc32(payload, zlib.crc32(_HEAD.pack(sync, kind, when, length, 0))) != check:
-        return None, 0, length
+    return data[at + _HEAD.size : end] if length <= _LONGEST and end <= len(data) else b""
+
+
+def _decode(data: bytes, at: int, payload: bytes) -> Record | None:
+    if not payload or zlib.crc32(payload) != _HEAD.unpack_from(data, at)[2]:
+        return None
     try:
-        return Record(Kind(kind), when, _content(Kind(kind), payload)), end - at, length
-    except Exception:  # A checksum can be forged; msgpack, struct and NumPy each raise their own.
-        return None, 0, length
-
-
-def _content(kind: Kind, payload: bytes) -> Any:
-    if kind in (Kind.SENT, Kind.RECEIVED):
-        return (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
-    if kind == Kind.NOTE:
-        return payload.decode()
-    return dict(msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False))
+        kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
+        return Record(Kind(kind), when, content)
+    except Exception:  # A checksum can be forged; msgpack and NumPy each raise their own.
+        return None
 
 
 def _pack_array(value: Any) -> Any:

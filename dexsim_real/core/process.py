@@ -7,12 +7,12 @@ disk and terminal output below them.
 import contextlib
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from typing import Any
 
 _PRIORITY = 20
 _STEP = 5
+_UNSUPPORTED = (OSError, AttributeError)  # not permitted; no such scheduler on this system
 
 
 def use_realtime() -> bool:
@@ -22,14 +22,14 @@ def use_realtime() -> bool:
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-    except (OSError, AttributeError):
+    except _UNSUPPORTED:
         return False
     return True
 
 
 def leave_realtime() -> None:
     """Return this thread to ordinary scheduling."""
-    with contextlib.suppress(OSError, AttributeError):
+    with contextlib.suppress(*_UNSUPPORTED):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
@@ -44,27 +44,9 @@ def lower_priority() -> None:
 
 
 def _change_priority(by: int) -> None:
-    with contextlib.suppress(OSError, AttributeError):  # A priority above that of `use_realtime` may be refused.
+    with contextlib.suppress(*_UNSUPPORTED):  # A priority above that of `use_realtime` may be refused.
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))
-
-
-@contextlib.contextmanager
-def loading() -> Iterator[None]:
-    """While modules load, Ctrl-C ends the program with one line: some modules abort, or show pages of their insides."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, _leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _leave(number: int, frame: Any) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(128 + number)
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
@@ -76,12 +58,10 @@ _interrupted = False  # whether one has
 def stopping(leaving: bool = False) -> Iterator[None]:
     """Within this context the first signal that would end or suspend the program interrupts it; later ones do nothing.
 
-    SIGTERM, SIGHUP, SIGQUIT and SIGTSTP (Ctrl-Z) raise SystemExit(128 + number), and SIGINT raises KeyboardInterrupt.
-    A second one could otherwise interrupt what turns the motors off. A shell starts background programs with SIGINT
-    ignored. It is handled here nevertheless, so that a moving hand can always be interrupted.
-
-    `leaving` says that the program ends afterwards: if it was interrupted, it ignores signals from then on, since a
-    late one would kill it before its exit code is given.
+    SIGINT raises KeyboardInterrupt, also in a program that a shell started in the background, with SIGINT ignored.
+    SIGTERM, SIGHUP, SIGQUIT and SIGTSTP (Ctrl-Z) raise SystemExit(128 + number). A second signal could otherwise
+    interrupt what turns the motors off. `leaving`: the program ends afterwards, so if it was interrupted, it ignores
+    signals from then on: a late one would kill it before its exit code is given.
     """
     global _armed, _interrupted
     before = {number: signal.signal(number, _interrupt) for number in _SIGNALS}

@@ -6,18 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+_BIN, _BINS = 1e-5, 5000  # s and number: the histogram ends at 50 ms
+GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
+
 
 class Timing:
-    """Statistics of durations in constant memory: a histogram of 10 us bins up to 50 ms."""
-
-    _BIN, _BINS = 1e-5, 5000
+    """Statistics of durations in constant memory."""
 
     def __init__(self) -> None:
-        self._bins = np.zeros(self._BINS + 1, np.int64)
+        self._bins = np.zeros(_BINS + 1, np.int64)
         self.count, self.missed, self.worst = 0, 0, 0.0
 
     def add(self, seconds: float) -> None:
-        self._bins[min(int(max(seconds, 0.0) / self._BIN), self._BINS)] += 1
+        self._bins[min(int(max(seconds, 0.0) / _BIN), _BINS)] += 1
         self.count += 1
         self.worst = max(self.worst, seconds)
 
@@ -26,20 +27,18 @@ class Timing:
         if not self.count:
             return float("nan")
         at = np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count)
-        return min((int(at) + 1) * self._BIN, self.worst)
+        return min((int(at) + 1) * _BIN, self.worst)
 
     def summary(self) -> dict[str, float]:
         """Percentiles in ms, number of samples, number of missed deadlines."""
+        p50, p99 = self.percentile(50), self.percentile(99)
         return {
             "count": self.count,
             "missed": self.missed,
-            "p50_ms": 1e3 * self.percentile(50),
-            "p99_ms": 1e3 * self.percentile(99),
+            "p50_ms": 1e3 * p50,
+            "p99_ms": 1e3 * p99,
             "max_ms": 1e3 * self.worst,
         }
-
-
-GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
 
 class Pace:
@@ -64,10 +63,10 @@ class Pace:
         self.next += self.period
 
 
-def keep_phase(rate: float, other: float, share: float = 0.01) -> float:
-    """`rate` rounded to a multiple of half of `other`, if that changes it by at most `share`.
+def keep_phase(rate: float, other: float) -> float:
+    """`rate` rounded to a multiple of half of `other`, if that changes it by at most 1 %.
 
     Two loops with such rates keep one or two fixed phases to each other.
     """
     near = max(round(2 * rate / other), 1) * other / 2
-    return near if abs(near - rate) <= share * rate else rate
+    return near if abs(near - rate) <= 0.01 * rate else rate

@@ -22,19 +22,13 @@ from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
-MEASURED = ("joint_position", "joint_torque", "taxel_force")
+_KEPT = 50  # newest frames, of which a tick used one
 _OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
 """Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
 class Replay:
-    """A log that is recomputed record by record.
-
-    Args:
-      path: of the log.
-      meta: configuration of the run.
-      hand: see `replay`.
-    """
+    """A log that is recomputed record by record; `meta` is the configuration of the run."""
 
     def __init__(self, path: Path, meta: dict[str, Any], hand: str):
         if options := _OTHERS.get(str(meta.get("task"))):
@@ -78,7 +72,7 @@ class Replay:
             report["frames"] += 1
             if frame[4:5] == bytes([frames.Command.EXCHANGE]):
                 self._states[number] = frame
-                self._states.pop(number - 50, None)
+                self._states.pop(number - _KEPT, None)
         elif record.kind == Kind.TICK:
             frame = self._states.get(content["sequence"])
             report["without_frame"] += frame is None
@@ -92,7 +86,7 @@ class Replay:
         self._sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
         measured = self._sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
         # The hand's measurements are recomputed; camera, goal and command are taken from the log.
-        again = {name: getattr(measured, name) for name in MEASURED}
+        again = {name: getattr(measured, name) for name in ("joint_position", "joint_torque", "taxel_force")}
         same = all(_same(value, tick["readings"][name]) for name, value in again.items())
         observation = np.asarray(self._observe(Readings(**{**tick["readings"], **again})))
         identical = _same(observation, tick["observation"])
@@ -107,11 +101,7 @@ class Replay:
 
 
 def replay(path: Path, hand: str = "") -> Replay:
-    """Recompute a log.
-
-    Args:
-      path: of the log.
-      hand: TOML of the hand, where it is not in the place that the log names.
+    """Recompute a log; `hand` is the TOML of the hand, where it is not in the place that the log names.
 
     Raises:
       ConfigError: the log is of another hand.

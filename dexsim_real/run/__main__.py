@@ -11,13 +11,11 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from dexsim_real.core.process import loading, stopping
-
-with loading():
-    from dexsim.core import cli
-    from dexsim_real.run.options import RunArguments
-    from dexsim_real.run.result import execute
-    from dexsim_real.run.status import show_summary
+from dexsim.core import cli
+from dexsim_real.core.process import stopping
+from dexsim_real.run.options import RunArguments
+from dexsim_real.run.session import execute
+from dexsim_real.run.status import show_summary
 
 
 def main(argv: Sequence[str] | None = None) -> int:

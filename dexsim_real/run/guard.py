@@ -46,12 +46,7 @@ _FROZEN = "the runner stood still, and was killed"
 
 
 class Guard:
-    """The runner's end: starts the process.
-
-    Args:
-      port: of the hand, as for `open_port`.
-      link: of the serial line.
-    """
+    """The runner's end: starts the process for a port, as for `open_port`."""
 
     def __init__(self, port: str, link: LinkConfig):
         root = str(Path(__file__).resolve().parents[2])
@@ -74,8 +69,7 @@ class Guard:
     def arm(self) -> None:
         """Wait until the process is ready; from now on it acts when this one ends, or `beat` is not called.
 
-        Raises:
-          HandError: it did not start.
+        Raises HandError: it did not start.
         """
         if not self._answered(_STARTUP):
             raise HandError("the guard process did not start; --no-guard runs without it")
@@ -85,8 +79,7 @@ class Guard:
     def beat(self, more: float = 0.0) -> None:
         """A sign of life of the thread that exchanges commands with the hand; it never blocks.
 
-        Args:
-          more: s, by which the next one may be later than usual.
+        The next one may be later than usual by `more` s.
         """
         now = time.monotonic()
         if self._armed and (now >= self._due or more):
@@ -95,11 +88,7 @@ class Guard:
             self._tell(b"%.3f" % (self._allowed + more))
 
     def check(self) -> None:
-        """Check that the process runs.
-
-        Raises:
-          HandError: it has ended, or is suspended.
-        """
+        """Raises HandError: the process has ended, or is suspended."""
         if self._process.poll() is not None:
             raise HandError("the guard process has ended")
         if self._answered(0.0):
@@ -161,9 +150,7 @@ def main(argv: Sequence[str]) -> int:
 def _watch(pipe: int, answers: int) -> str:
     """Wait until the motors must be turned off; returns why, or nothing after an orderly end.
 
-    Args:
-      pipe: from the runner, with its signs of life.
-      answers: to the runner, one for each of them and one for a start.
+    `pipe` has the runner's signs of life; each gets one of the `answers`, and so does the start.
     """
     rest, on, until = b"", False, math.inf
     while True:

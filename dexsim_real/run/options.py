@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig
@@ -16,7 +16,7 @@ from dexsim_real.wire.link import LinkConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunArguments:
+class RunArguments(Config):
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -74,7 +74,7 @@ class RunArguments:
     """Pose of the camera, and colour of the object."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_mount(self.imu_mount, "--imu-mount")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")

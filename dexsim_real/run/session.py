@@ -1,4 +1,7 @@
-"""A run on the hand: connect, tare, approach, run the policy, and end with the motors off."""
+"""A run on the hand: connect, tare, approach, run the policy, and end with the motors off.
+
+`run_policy` is a whole run as one call, for programs and notebooks; `python -m dexsim_real.run` is the same call.
+"""
 
 import contextlib
 import dataclasses
@@ -19,18 +22,17 @@ from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller
+from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.control.motors_off import UNCONFIRMED
 from dexsim_real.control.policy_loop import PolicyLoop, PolicyTick, limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
+from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.loop import LoopThread
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.outcome import Outcome
 from dexsim_real.run.status import HandState, StatusView
 from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
@@ -47,6 +49,121 @@ _QUESTION = (
     "Is the power switch within reach, and the hand's room clear? [y/N] "
 )
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
+_BLIND = 0.1  # share of the time without a measurement that a run may have, such as a cable that was out for a moment
+_HELD = 0.5  # share of the time in which `Safety` may have held the hand
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """How a run ended, and what it measured."""
+
+    end: str  # why: "time is over", a safety reaction, a signal, or what failed
+    code: int  # 0 for a whole run, 1 if something ended it or is missing, 128 + n after signal n
+    problem: str  # what ended it early, or what it lacks; empty for a whole run, and after a signal
+    log: Path  # of all frames and ticks, for `python -m dexsim_real.replay`
+    summary: dict[str, Any]
+    """Statistics: seconds, forces in N, successes, jitter, link, cycles by safety reason. If `motors_off` is false, the
+    hand has not confirmed that they are: press the emergency stop. `missing` lists what is no success."""
+
+
+def run_policy(
+    policy: str | Path, port: str, calibration: str | Path | None = None, *, seconds: float = 30.0, **options: Any
+) -> RunResult:
+    """Run a policy on a hand: connect, tare, approach, policy, motors off. Asks before the motors come on.
+
+        result = dexsim_real.run_policy("grasp", "/dev/ttyUSB0", "hand.toml", seconds=10, command=0.6, camera="0")
+
+    Args:
+      policy: file, or name of a shipped policy.
+      port: serial port of the hand, or sdk:MODULE:FUNCTION.
+      calibration: file of this hand; None for default scales.
+      seconds: duration after the approach.
+      options: further fields of `RunArguments`; `yes=True` asks nothing.
+
+    Raises:
+      HandError: the hand or a sensor cannot be reached, or nobody said yes; nothing has moved.
+      DexsimError: the policy, the calibration or an option cannot be used.
+    """
+    file = None if calibration is None else Path(calibration)
+    arguments = RunArguments(
+        policy=str(policy), port=port, calibration=file, uncalibrated=file is None, seconds=seconds, **options
+    )
+    with stopping():
+        return execute(arguments)
+
+
+def execute(arguments: RunArguments) -> RunResult:
+    """Run with these options, within `stopping`; see `run_policy`."""
+    if not (arguments.yes or arguments.motors_off):
+        check_terminal()
+    prepare_jax()
+    cli.enable_caches()
+    session = Session(arguments)
+    reason, code = "", 0
+    try:
+        try:
+            session.prepare()
+            session.run()
+        except HandError as error:
+            reason, code = str(error), 1
+            if not (session.started or session.safety.engaged):  # Nothing has moved.
+                raise
+        except KeyboardInterrupt:
+            reason, code = "Ctrl-C", 130
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) and stop.code > 128 else 1
+            reason = f"signal {code - 128}" if code > 128 else f"a driver exits: {stop.code}"
+        except BaseException as error:
+            reason = f"failure: {error!r}"
+            raise
+        finally:
+            session.close(reason)
+    finally:  # Again: the one signal that interrupts may have come just before the line above.
+        session.close(reason)
+    summary = session.summary()
+    code = code if summary["motors_off"] else 1
+    problem = session.end if code == 1 else "; ".join(summary["missing"]) if code == 0 else ""
+    return RunResult(session.end, 1 if problem else code, problem, session.log.path, summary)
+
+
+class Outcome:
+    """Whether a run did what it was started for: a hand that was gone or held, or lost records, are no success."""
+
+    def __init__(self, began: float = 0.0):
+        self._last = began
+        self._total = self._blind = self._held = 0.0  # s
+        self._actions = self._wrong = 0
+        self._reason = self._silence = ""  # of the newest hold, and of the newest refusal
+
+    def add(self, now: float, target: np.ndarray | None, safety: Safety) -> None:
+        """Count the time up to `now` s; `target` [J] is the policy's, None when no measurement was young enough."""
+        step, self._last = now - self._last, now
+        self._total += step
+        if target is None:
+            self._blind += step
+            self._silence = safety.refused or self._silence
+        else:
+            self._actions += 1
+            self._wrong += not np.isfinite(target).all()
+        reaction, reason = safety.last
+        if safety.engaged and reaction >= Reaction.HOLD:
+            self._held += step
+            self._reason = reason
+
+    def missing(self, log: LogWriter) -> list[str]:
+        """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
+        lines = []
+        if self._blind > _BLIND * self._total:
+            why = f" ({self._silence})" if self._silence else ""
+            lines.append(f"no measurement for {100 * self._blind / self._total:.0f} % of the run{why}")
+        if self._wrong:
+            lines.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
+        if self._held > _HELD * self._total:
+            share = 100 * self._held / self._total
+            lines.append(f"the hand was held for {share:.0f} % of the run, last because: {self._reason}")
+        if log.dropped or log.failure:
+            lines.append(f"{log.dropped} log records are lost ({log.failure or 'the disk is too slow'})")
+        return lines
 
 
 class Session:
@@ -70,15 +187,14 @@ class Session:
         self.safety = Safety(hand, limits_for(arguments.safety, self.controller), self._react)
         # Not earlier: compiling in a real-time thread would starve the machine.
         realtime = arguments.realtime and use_realtime()
-        path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
-        self.log = LogWriter(path)
+        self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log"))
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         beat = self.guard.beat if self.guard else lambda more: None
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
         self.loop.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
-        self._policy: PolicyLoop | None = None  # from `prepare` on
+        self.policy: PolicyLoop | None = None  # from `prepare` on
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = 0.0
         self.outcome = Outcome()
@@ -104,7 +220,7 @@ class Session:
         self._write_meta()
         self.loop.start()
         self._await_pose()
-        self._policy = PolicyLoop(
+        self.policy = PolicyLoop(
             self.controller,
             self.safety,
             open_objects(arguments, self.controller),
@@ -120,6 +236,7 @@ class Session:
         Raises:
           HandError: the answer was not yes, or `Safety` or a failure ended the run.
         """
+        assert self.policy is not None, "`prepare` comes first"
         if not (self.arguments.yes or self.arguments.motors_off):
             self.view.show()
             ask()
@@ -139,7 +256,8 @@ class Session:
                 pace.wait()
             self.policy.begin()
             self._note("the policy starts")
-            self.end = self._run_policy()
+            self._run_policy(self.policy)
+            self.end = "time is over"
 
     def close(self, reason: str = "") -> None:
         """Turn the motors off and close everything; may be called at any stage, and again."""
@@ -152,8 +270,8 @@ class Session:
             self.guard.dismiss(off=not self.loop.driven)
         if self.loop.driven:
             self.end += f"; {UNCONFIRMED}: press the emergency stop"
-        if self._policy:
-            self._policy.objects.close()
+        if self.policy:
+            self.policy.objects.close()
         self._note(f"end: {self.end}")
         self.log.add(Kind.END, self.summary())
         self.log.close()
@@ -164,7 +282,7 @@ class Session:
 
     def summary(self) -> dict[str, Any]:
         """Results and statistics of the run so far; JSON-able."""
-        loop, safety, policy = self.loop, self.safety, self._policy
+        loop, safety, policy = self.loop, self.safety, self.policy
         reaction, reason = safety.last
         summary = {
             "end": self.end,
@@ -188,12 +306,6 @@ class Session:
             times = [t - self.started for t in policy.goals.times]
             summary |= {"successes": policy.goals.successes, "success_times": times}
         return summary
-
-    @property
-    def policy(self) -> PolicyLoop:
-        """The policy's side, from `prepare` on."""
-        assert self._policy is not None, "`prepare` comes first"
-        return self._policy
 
     def hand_state(self) -> HandState | None:
         """What the view shows of the hand; None without a measurement. Called from the view's thread."""
@@ -226,8 +338,8 @@ class Session:
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
 
-    def _run_policy(self) -> str:
-        """Tick until the time is over; returns why it ended."""
+    def _run_policy(self, policy: PolicyLoop) -> None:
+        """Tick until the time is over."""
         self.started = time.monotonic()
         self.outcome = Outcome(self.started)
         self.loop.forget()
@@ -236,7 +348,7 @@ class Session:
         self.pace.next = self.loop.free(self.pace.next)
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
-            newest = self.policy.tick(now)
+            newest = policy.tick(now)
             self.outcome.add(now, newest.tick.target if newest else None, self.safety)
             if newest is not None:
                 self.newest = newest
@@ -244,7 +356,6 @@ class Session:
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
         self._check()
-        return "time is over"
 
     def _log_tick(self, now: float, newest: PolicyTick) -> None:
         tick, sample = newest
@@ -274,14 +385,14 @@ class Session:
 
     def _write_meta(self) -> None:
         arguments, policy = self.arguments, self.controller.policy
-        leaves = jax.tree.leaves(policy.params)
+        leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params))
         self.log.add(
             Kind.META,
             {
                 "task": policy.task,
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
-                "policy_sha256": hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest(),
+                "policy_sha256": hashlib.sha256(leaves).hexdigest(),
                 "hand": record_of(self.sensing.hand),
                 "calibration": arguments.calibration.read_text() if arguments.calibration else "",
                 "tare": self.sensing.tare,
@@ -302,11 +413,7 @@ def check_terminal() -> None:
 
 
 def ask() -> None:
-    """Ask on the terminal whether the motors may come on.
-
-    Raises:
-      HandError: the answer is not yes.
-    """
+    """Ask on the terminal whether the motors may come on. Raises HandError: the answer is not yes."""
     with contextlib.suppress(OSError, ValueError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # What was typed before the question is no answer to it.
     print(_QUESTION, end="", file=sys.stderr, flush=True)

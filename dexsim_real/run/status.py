@@ -1,12 +1,11 @@
 """The status of a run on the terminal: live tables, or a line every few seconds when the output is no terminal."""
 
 import contextlib
-import dataclasses
 import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO, cast
+from typing import Any, NamedTuple, TextIO, cast
 
 import numpy as np
 from rich import box
@@ -22,8 +21,7 @@ from dexsim_real.sensors.hand import HandMeasurement
 _LIVE, _LINES = 0.25, 5.0  # s between two updates of the tables, and between two lines
 
 
-@dataclasses.dataclass(frozen=True)
-class HandState:
+class HandState(NamedTuple):
     """What the view shows of the hand."""
 
     hand: Hand
@@ -52,14 +50,7 @@ class _Lasting:
 
 
 class StatusView:
-    """Shows the state of a run from a background thread. A context manager.
-
-    Args:
-      title: of the tables.
-      summary: results so far; called from the background thread, and by `show`, like the next.
-      hand: the state of the hand; None without a measurement.
-      quiet: show nothing.
-    """
+    """Shows the state of a run from a background thread, which calls `summary` and `hand`. A context manager."""
 
     def __init__(
         self,
@@ -126,6 +117,11 @@ def show_summary(title: str, summary: dict[str, Any]) -> None:
     _console().print(_rows(title, summary))
 
 
+def _console(quiet: bool = False) -> Console:
+    stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
+    return Console(stderr=True, quiet=quiet, file=stream)
+
+
 def _rows(title: str, summary: dict[str, Any]) -> Table:
     # Escaped, since an error may have text in brackets, which Rich would take for its markup.
     table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
@@ -136,20 +132,23 @@ def _rows(title: str, summary: dict[str, Any]) -> Table:
 
 def _texts(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and text of each entry that says something."""
+
+    def short(value: Any) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
     for name, value in summary.items():
         if isinstance(value, dict):
-            value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v)
+            value = ", ".join(f"{k} {short(v)}" for k, v in value.items() if v)
         if value not in ("", []):
-            yield name.replace("_", " "), _short(value)
+            yield name.replace("_", " "), short(value)
 
 
 def _hand_tables(state: HandState) -> Table:
     """Joints on the left, with the error registers of their boards; fingertips on the right."""
     hand, measured = state.hand, state.measured
     heat, force = measured.temperature, measured.finger_force
-    joints = _table("joint (rad)", "measured", "target" if state.sent else "(not sent)", "A", "degC")
-    for board in ("errors: palm", "joint", "tip"):
-        joints.add_column(board, justify="right")
+    target = "target" if state.sent else "(not sent)"
+    joints = _table("joint (rad)", "measured", target, "A", "degC", "errors: palm", "joint", "tip")
     for joint, name in enumerate(hand.joint_names):
         joints.add_row(
             f"{joint:2d} {name}",
@@ -175,12 +174,3 @@ def _table(first: str, *others: str) -> Table:
     for name in others:
         table.add_column(name, justify="right", no_wrap=True)
     return table
-
-
-def _console(quiet: bool = False) -> Console:
-    stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
-    return Console(stderr=True, quiet=quiet, file=stream)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

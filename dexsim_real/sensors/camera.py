@@ -66,17 +66,10 @@ def camera_axes(config: CameraConfig) -> np.ndarray:
 
 
 def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axis: int) -> float | None:
-    """Coordinate m of the object along an axis of the palm frame.
+    """Coordinate m of the object along an axis (0, 1 or 2) of the palm frame, by a mask [H, W] bool.
 
-    Args:
-      mask: [H, W] bool.
-      config: of the camera.
-      reference: [3] m, the object's other coordinates.
-      axis: 0, 1 or 2.
-
-    Returns:
-      The coordinate of the point on the axis nearest to the ray through the mask's centroid. None when the mask is
-      too small, or the ray is parallel to the axis.
+    It is that of the point on the axis through `reference` [3] m which is nearest to the ray through the mask's
+    centroid. None when the mask is too small, or the ray is parallel to the axis.
     """
     rows, columns = np.nonzero(mask)
     if rows.size < config.min_area:
@@ -92,17 +85,10 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
 
 
 class HeightSensor:
-    """Tracks the object from its own thread; `read` returns the newest position and velocity.
+    """Tracks the object from its own thread.
 
-    Args:
-      masks: source of masks.
-      config: of the camera.
-      reference: [3] m, the object's coordinates that are not measured.
-      axes: which coordinates are measured (`Sensing.object_axes`): exactly one.
-      weight: of the newest difference in the velocity (`Sensing.velocity_filter`).
-
-    Raises:
-      HandError: `axes` are not exactly one.
+    `axes` tells which coordinate is measured (`Sensing.object_axes`): exactly one, else HandError. The others are those
+    of `reference` [3] m. `weight` is of the newest difference in the velocity (`Sensing.velocity_filter`).
     """
 
     def __init__(
@@ -127,8 +113,7 @@ class HeightSensor:
 
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Time of the newest measurement (s, monotonic clock), position [3] m and filtered velocity [3] m/s."""
-        if self._newest is None:
-            raise HandError("the camera has not seen the object yet; wait until `seen` is true")
+        assert self._newest is not None, "wait until `seen` is true"
         return self._newest
 
     def see(self, when: float, mask: np.ndarray) -> None:
@@ -170,15 +155,11 @@ class HeightSensor:
 
 
 def open_masks(spec: str, config: CameraConfig) -> Masks:
-    """A source of masks.
+    """A source of masks, by what `spec` is: a camera number or video file, whose pictures the colours of `config`
+    segment; `unix:PATH` for a program that sends records of `encode_mask`; or `MODULE:FUNCTION` for a function from a
+    BGR picture [H, W, 3] uint8 of camera 0 to a bool mask [H, W].
 
-    Args:
-      spec: a camera number or video file; `unix:PATH` for a program that sends records of `encode_mask`; or
-        `MODULE:FUNCTION` for a function from a BGR picture [H, W, 3] uint8 of camera 0 to a bool mask [H, W].
-      config: of the camera; its colours segment the pictures of a camera or file.
-
-    Raises:
-      HandError: it cannot be opened.
+    Raises HandError: it cannot be opened.
     """
     if spec.startswith("unix:"):
         return _stream(spec.removeprefix("unix:"))

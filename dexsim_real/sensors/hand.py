@@ -1,4 +1,4 @@
-"""From reported values to SI units: calibration, tare, dead taxels, filtered velocities."""
+"""From reported values to SI units: calibration, tare, masked taxels, filtered velocities."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,12 +10,13 @@ from dexsim.calibration.maps import Calibration, current_from_counts, normalised
 from dexsim.core.config import Config, setting
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.taxel_zero import ZeroTracker
-from dexsim_real.sensors.taxels import StuckTaxels, judge_rest, taxel_names
+from dexsim_real.sensors.taxels import StuckTaxels, ZeroTracker, judge_rest, taxel_names
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
 _JOINTS = frames.JOINTS
+_VELOCITY_TIME = 0.02  # s, time constant of the filter on differences of the joint angle
+_WANDERED = 30.0  # counts by which a fingertip's zero may move before a new tare is advised: 3 N by the vendor's 0.1 N
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,21 +46,13 @@ class HardwareConfig(Config):
     """Force of a taxel: its normal component (z), or the norm of all three components (norm)."""
     taxel_floor: float = setting(1.0, unit="count", low=0.0, high=255.0)
     """Tared counts below this read as zero."""
-    tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
-    """Count above which a taxel cannot be tared: alone it is stuck, and several adjacent ones touch something."""
     tare_sum: float = setting(50.0, unit="count", low=0.0, high=30600.0)
-    """Largest sum of a fingertip's counts when it is tared: the largest load that taring can hide, 5 N by the vendor's
-    0.1 N."""
-    track_zero: bool = True
-    """Follow the zero of taxels that touch nothing, which wanders with temperature; `tare_sum` bounds it, too."""
+    """Largest sum of a fingertip's counts when it is tared, and of its zeros afterwards: the largest load that they can
+    hide, 5 N by the vendor's 0.1 N."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
     """Sign of the current without a calibration: -1 when a positive current opens the hand."""
     current_scale: float = setting(1000.0, unit="mA", low=1.0, high=20000.0)
     """Current that reads as torque 1 without a calibration (not measured)."""
-    reported_velocity: bool = setting(False)
-    """Use the velocity reported by newer firmware instead of differences of the joint angle."""
-    velocity_time: float = setting(0.02, unit="s", low=0.0, high=1.0)
-    """Time constant of the filter on differences of the joint angle."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -104,15 +97,8 @@ def check_wire(hand: Hand) -> None:
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
 
-    `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one.
-
-    Args:
-      hand: model of the hand.
-      config: signs, scales and gains.
-      calibration: of this hand; None uses the scales of `config`.
-
-    Raises:
-      HandError: the model has other joints or taxels than the frames.
+    `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one. Without
+    a calibration of this hand the scales of `config` count. HandError: the model has other joints or taxels.
     """
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
@@ -121,6 +107,7 @@ class HandSensing:
         self._sign = np.array(config.joint_sign, np.float32)
         self._offset = np.array(config.joint_offset, np.float32)
         self.tare = np.zeros((frames.TIPS, frames.TAXELS), np.float32)
+        self._tared, self._advised = self.tare, np.zeros(frames.TIPS, bool)
         self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
         if calibration is None:
             self._per_count = np.full((frames.TIPS, 1), config.force_per_count, np.float32)
@@ -149,50 +136,30 @@ class HandSensing:
         )
 
     def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:
-        """Tare the taxels: their mean counts over these states read as no force from now on. Mask stuck ones.
+        """Tare the taxels: their mean counts over these `frames.STATE_BLOCK`s of an untouched hand read as no force.
 
-        Args:
-          states: `frames.STATE_BLOCK` of an untouched hand.
-
-        Returns:
-          One line for each fingertip with stuck taxels.
-
-        Raises:
-          HandError: a fingertip touches something, or has many stuck taxels.
+        Stuck taxels are masked; returns a line for each fingertip with some. Raises HandError: a fingertip touches
+        something, or has many stuck taxels.
         """
         counts = np.asarray(np.mean([self.counts(state) for state in states], axis=0, dtype=np.float32))
-        stuck = judge_rest(self.hand, counts, self.config.tare_limit, self.config.tare_sum)
-        self.tare = np.where(stuck, np.float32(np.inf), counts)
+        stuck = judge_rest(self.hand, counts, self.config.tare_sum)
+        self.tare = self._tared = np.where(stuck, np.float32(np.inf), counts)
+        self._advised[:] = False
         return self._say_masked(stuck)
 
-    def mask_stuck(self, state: np.ndarray, limit: float) -> list[str]:
-        """Mask taxels that have got stuck, given every answer of a run.
+    def follow_taxels(self, time: float, state: np.ndarray, limit: float) -> tuple[bool, list[str]]:
+        """Mask taxels that have got stuck and follow the zeros of those that touch nothing, by every answer of a run.
 
-        Args:
-          state: a `frames.STATE_BLOCK`.
-          limit: N, the largest force of a finger.
-
-        Returns:
-          One line for each fingertip with taxels masked by this answer.
+        `limit` N is the largest force of a finger. Returns whether `tare` has changed, and lines about masked taxels
+        and zeros that have moved far.
         """
-        counts = np.maximum(self.counts(state) - self.tare, 0.0)
-        stuck = self._stuck.find(counts, limit / self._per_count)
-        if stuck is None:
-            return []
-        self.tare = np.where(stuck, np.float32(np.inf), self.tare)
-        return self._say_masked(stuck)
-
-    def track_zero(self, time: float, state: np.ndarray) -> bool:
-        """Follow the zero of taxels that touch nothing, given every answer of a run; whether `tare` has changed.
-
-        Args:
-          time: s of the answer.
-          state: a `frames.STATE_BLOCK`.
-        """
-        before = self.tare
-        if self.config.track_zero:
-            self.tare = self._zero.update(time, self.counts(state), before)
-        return not np.array_equal(self.tare, before)
+        before, lines, counts = self.tare, list[str](), self.counts(state)
+        stuck = self._stuck.find(np.maximum(counts - before, 0.0), limit / self._per_count)
+        if stuck.any():
+            self.tare = np.where(stuck, np.float32(np.inf), before)
+            lines = self._say_masked(stuck)
+        self.tare = self._zero.update(time, counts, self.tare)
+        return not np.array_equal(self.tare, before), lines + self._say_wandered()
 
     def _say_masked(self, stuck: np.ndarray) -> list[str]:
         return [
@@ -201,16 +168,23 @@ class HandSensing:
             if which.any()
         ]
 
+    def _say_wandered(self) -> list[str]:
+        """A line, once, for each fingertip whose zeros have moved far since they were tared."""
+        known = np.isfinite(self.tare) & np.isfinite(self._tared)
+        moved = np.where(known, self.tare, 0.0).sum(1) - np.where(known, self._tared, 0.0).sum(1)
+        new = (np.abs(moved) > _WANDERED) & ~self._advised
+        self._advised |= new
+        return [
+            f"{self.hand.finger_names[finger]}: its zero has moved by {moved[finger]:.0f} counts since it was tared; "
+            "end the run, and start another with nothing touching the fingertips"
+            for finger in np.flatnonzero(new)
+        ]
+
     def command(self, position: np.ndarray, mode: Mode, stiffness: float = 1.0) -> np.ndarray:
         """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.
 
-        Args:
-          position: [J] rad.
-          mode: of all joints.
-          stiffness: share of the gains kp and ki in [0, 1]; those of damping are always whole.
-
-        Raises:
-          HandError: an angle is not finite.
+        `stiffness` is a share of the gains kp and ki in [0, 1]; those of damping are always whole. Raises HandError: an
+        angle is not finite.
         """
         config, on = self.config, mode == Mode.POSITION
         block = frames.command_block(
@@ -225,12 +199,6 @@ class HandSensing:
             raise HandError("a command is not finite; it was not sent")
         return block
 
-    def velocity(self, state: np.ndarray) -> np.ndarray | None:
-        """Reported joint velocities [J] rad/s; None when they must be estimated."""
-        if not self.config.reported_velocity:
-            return None
-        return state["joint"]["velocity"].astype(np.float32) * np.float32(1e-3) * self._sign
-
     def counts(self, state: np.ndarray) -> np.ndarray:
         """Raw taxel counts [F, N], neither tared nor scaled."""
         taxel = state["tip"]["taxel"]
@@ -240,14 +208,9 @@ class HandSensing:
 
 
 class VelocityFilter:
-    """Joint velocities: differences of the joint angles through a first-order filter.
+    """Joint velocities: differences of the joint angles through a first-order filter."""
 
-    Args:
-      time_constant: s.
-    """
-
-    def __init__(self, time_constant: float):
-        self._constant = time_constant
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -260,7 +223,7 @@ class VelocityFilter:
         if self._last is None or time <= self._last[0]:
             return self.velocity
         step = time - self._last[0]
-        weight = step / (step + self._constant)
+        weight = step / (step + _VELOCITY_TIME)
         rate = (position - self._last[1]) / step
         return (self.velocity + weight * (rate - self.velocity)).astype(np.float32)
 

@@ -23,7 +23,8 @@ BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
 _FASTEST = 30.0  # rad/s that an object may turn
 _JUMP = 0.3  # rad, for samples that arrive together
-_SAMPLES = 5  # in a row that are far from the last, and then true: a damaged frame may have a right checksum
+_GAP = 0.05  # s, longest motion that an interval between two samples explains
+_SAMPLES = 5  # in a row that are far from the last make a jump: a damaged frame may have a right checksum
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
@@ -68,14 +69,13 @@ def decode(frame: bytes) -> np.ndarray | None:
 
 
 class RvcParser:
-    """Extracts orientations from a stream of bytes; damaged frames are counted and skipped."""
+    """Extracts index and orientation of the frames in a stream of bytes; damaged ones are counted and skipped."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.damaged = 0
 
     def feed(self, data: bytes) -> list[tuple[int, np.ndarray]]:
-        """Add received bytes; returns index and orientation of the frames that they complete."""
         self._buffer += data
         buffer, quats, done = self._buffer, [], 0
         while (at := buffer.find(HEAD, done)) >= 0 and at + SIZE <= len(buffer):
@@ -102,14 +102,11 @@ def conjugate(a: np.ndarray) -> np.ndarray:
 
 
 def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The rotation [4] from the IMU's world frame to the palm frame, from one known pose.
+    """The rotation [4] from the IMU's world frame to the palm frame.
 
-    All three angles come from the pose. Gravity would give two of them only if the palm's own lean were known: a mount
+    `sensed` [4] is the orientation of the IMU in its world frame, `known` [4] that in the palm frame at the same time.
+    All three angles come from this pose. Gravity would give two of them only if the palm's own lean were known: a mount
     that leans would then look like a turned object. What the pose is off by stays as a constant error.
-
-    Args:
-      sensed: [4] orientation of the IMU in its world frame.
-      known: [4] orientation of the IMU in the palm frame at the same time.
     """
     return multiply(known, conjugate(sensed))
 
@@ -118,11 +115,8 @@ class ImuReader:
     """From an IMU's bytes to the orientation of the object in the palm frame.
 
     A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
-    the last than an object turns is left out, unless the next ones are, too.
-
-    Args:
-      mount: [4] orientation of the IMU in the object.
-      port: name of its port, for messages.
+    the last than an object turns is left out; when the next ones are, too, `jumped` is true until they come back.
+    `mount` [4] is the orientation of the IMU in the object, `port` its name for messages.
     """
 
     def __init__(self, mount: tuple[float, ...] = UPRIGHT_X, port: str = "IMU"):
@@ -130,7 +124,12 @@ class ImuReader:
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
-        self._last_index, self._far = -1, 0
+        self._last_index, self._far = -1, 0  # index of the last frame; samples in a row that are far from the last
+
+    @property
+    def jumped(self) -> bool:
+        """Whether the orientation has changed faster than an object turns, as of an IMU that lost its reference."""
+        return self._far >= _SAMPLES
 
     def receive(self, time: float, data: bytes) -> None:
         """Update with bytes that were received at a time in s."""
@@ -140,10 +139,10 @@ class ImuReader:
             self._last_index = index
             when, before = self._newest or (time, quat)
             angle = 2.0 * math.acos(min(abs(float(quat @ before)), 1.0))
-            self._far = self._far + 1 if angle > _JUMP + _FASTEST * (time - when) else 0
-            if self._far in (0, _SAMPLES):
+            self._far = self._far + 1 if angle > _JUMP + _FASTEST * min(time - when, _GAP) else 0
+            if self._far == 0 or (self.jumped and self._world is None):  # Nothing relies on the last one yet.
                 # q and -q are one orientation: take the one nearer to the last, as in simulation.
-                self._newest = time, quat if quat @ before >= 0 else -quat
+                self._newest, self._far = (time, quat if quat @ before >= 0 else -quat), 0
 
     def calibrate(self, known: np.ndarray) -> None:
         """Align: the object now has the orientation `known` [4] in the palm frame."""
@@ -168,11 +167,7 @@ class ImuReader:
 
 
 class Imu(ImuReader):
-    """Reads an IMU from its own thread; `read` returns the newest orientation in the palm frame.
-
-    Args:
-      port: serial port of the IMU.
-      mount: [4] orientation of the IMU in the object.
+    """Reads the IMU at a serial port from its own thread.
 
     Raises:
       HandError: the port cannot be opened.
@@ -193,11 +188,7 @@ class Imu(ImuReader):
         self._thread.start()
 
     def wait(self, seconds: float = 2.0) -> None:
-        """Wait for the first orientation.
-
-        Raises:
-          HandError: none arrived in this time.
-        """
+        """Wait for the first orientation. Raises HandError: none arrived in this time."""
         until = time.monotonic() + seconds
         while self._newest is None:
             if time.monotonic() > until:

@@ -9,12 +9,7 @@ from dexsim_real.sensors.readings import ObjectEstimate
 
 
 class ObjectSensors:
-    """Camera and IMU; a coordinate that neither measures is taken as fixed.
-
-    Args:
-      reference: [3] m, nominal position of the object.
-      camera, imu: None without one.
-    """
+    """Camera and IMU, None without one. What neither measures is fixed: `reference` [3] m is the nominal position."""
 
     def __init__(self, reference: np.ndarray, camera: HeightSensor | None, imu: ImuReader | None):
         self._reference, self._camera, self._imu = np.asarray(reference, float), camera, imu
@@ -26,8 +21,7 @@ class ObjectSensors:
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
 
-        Raises:
-          HandError: no picture will come any more.
+        Raises HandError: no picture will come any more.
         """
         if self._camera and not self._camera.seen:
             if self._camera.failure:
@@ -46,9 +40,11 @@ class ObjectSensors:
         return ObjectEstimate(position, velocity, quat, self._imu.palm_gravity), when
 
     def lost(self, now: float, limit: float) -> str:
-        """Why a measurement is older than `limit` s, with the sensor; empty if none is."""
+        """Why a measurement is older than `limit` s, or its sensor is not to be trusted; empty if all is well."""
         if self._camera and now - self._camera.read()[0] > limit:
             return self._camera.failure or "the object is out of sight"
+        if self._imu and self._imu.jumped:
+            return "the orientation that the IMU sends has jumped"
         return "the IMU is silent" if self._imu and now - self._imu.read()[0] > limit else ""
 
     def close(self) -> None:

@@ -25,11 +25,7 @@ class ObjectEstimate:
 
 
 def sources_of(names: Sequence[str]) -> set[str]:
-    """The sensors ("hand", "camera", "imu", ...) that an observation with these fields needs.
-
-    Raises:
-      HandError: no sensor of the bridge measures a field.
-    """
+    """The sensors ("hand", "camera", "imu", ...) for these observation fields. HandError: none measures one of them."""
     for name in names:
         if name not in FIELDS or FIELDS[name].source not in SOURCES:
             raise HandError(
@@ -41,12 +37,9 @@ def sources_of(names: Sequence[str]) -> set[str]:
 def make_readings(
     measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float, actions: np.ndarray
 ) -> Readings:
-    """The `Readings` of one tick, float32 as in simulation.
+    """The `Readings` of one tick, float32 as in simulation; `goal_quat` [4] of the object, grip command in [0, 1].
 
-    Args:
-      goal_quat: [4] goal orientation of the object.
-      command: grip command in [0, 1].
-      actions: [3, J] the action that led to these measurements and the two before it, newest first.
+    `actions` [3, J] are the one that led to these measurements and the two before it, newest first.
     """
     values = {
         "joint_position": measured.joint_position,

@@ -2,9 +2,9 @@
 
     55 AA | source | target | command | length, low byte first | data | CRC, low byte first
 
-The CRC is CRC-16/XMODEM over everything before it. The module serves both ends of the line: a host sends
-`EXCHANGE` with twelve joint commands and receives the whole state; an emulated hand does the reverse. Layouts come
-from public drivers and headers; docs/hardware.md says how certain each one is.
+The CRC is CRC-16/XMODEM over everything before it. A host sends `EXCHANGE` with twelve joint commands and receives the
+whole state; an emulated hand does the reverse. Layouts come from public drivers and headers; docs/hardware.md says how
+certain each one is.
 """
 
 import binascii
@@ -155,14 +155,11 @@ class ParserCounts:
 
 
 class Parser:
-    """Extracts frames from a damaged or truncated stream of bytes.
+    """Extracts frames from a damaged or truncated stream of bytes; memory is bounded by one frame and one chunk.
 
-    A header is valid only with a known command and a length that this command can have; then the checksum decides.
-    When it fails, the search continues one byte after that header, so every intact frame of the stream is found.
-    Memory is bounded by one frame and one chunk.
-
-    Args:
-      lengths: possible data lengths of each command, `HAND_REPLIES` or `HOST_REQUESTS`.
+    A header is valid only with a known command and a length that this command can have, by `lengths`: `HAND_REPLIES` or
+    `HOST_REQUESTS`. Then the checksum decides. When it fails, the search continues one byte after that header, so every
+    intact frame of the stream is found.
     """
 
     def __init__(self, lengths: Mapping[int, range]):
@@ -247,10 +244,7 @@ def command_block(
     torque_max: np.ndarray | int,
     mode: np.ndarray | int = Mode.POSITION,
 ) -> np.ndarray:
-    """A `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current limit in mA.
-
-    A scalar applies to all joints.
-    """
+    """A `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current limit in mA; a scalar is for all."""
     block = np.zeros((), COMMAND_BLOCK)
     block["id"] = np.arange(JOINTS)
     block["position"] = position
@@ -268,22 +262,14 @@ def empty_state() -> np.ndarray:
 
 
 def decode_command(data: bytes) -> np.ndarray:
-    """Joint commands [12] from the data of a host's `EXCHANGE`.
-
-    Raises:
-      FrameError: wrong size, or the ids are not 0 to 11.
-    """
+    """Joint commands [12] from the data of a host's `EXCHANGE`. FrameError: wrong size, or the ids are not 0 to 11."""
     block = _decode(data, COMMAND_BLOCK)
     _check_ids(block["id"])
     return block
 
 
 def decode_state(data: bytes) -> np.ndarray:
-    """The state from the data of a hand's `EXCHANGE`.
-
-    Raises:
-      FrameError: wrong size, or the joint ids are not 0 to 11.
-    """
+    """The state from the data of a hand's `EXCHANGE`. FrameError: wrong size, or the joint ids are not 0 to 11."""
     block = _decode(data, STATE_BLOCK)
     _check_ids(block["joint"]["id"])
     return block

@@ -42,13 +42,7 @@ def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
 def check_identity(identity: Identity | None, hand: Hand, calibration: Calibration | None = None) -> list[str]:
     """Check that a hand fits the model and the calibration; returns notes about what could not be checked.
 
-    Args:
-      identity: None if the port cannot tell it.
-      hand: model of the hand.
-      calibration: the one that will be used.
-
-    Raises:
-      HandError: it is another hand.
+    `identity` is None if the port cannot tell it. Raises HandError: it is another hand.
     """
     serial, side = (identity.serial_number, identity.handedness.lower()) if identity else ("", "")
     model = next((name for name in ("left", "right") if name in hand.name), "")

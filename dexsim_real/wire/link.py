@@ -10,17 +10,46 @@ from typing import Protocol
 
 import numpy as np
 
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
-from dexsim_real.wire.refusals import Refusal
 
 BITS_PER_BYTE = 10  # 8N1
 _AHEAD = 1.0  # s, by which no stamp of the same clock is ahead
+_BASE = 1501000
+_NAMES = {
+    1: "wrong id",
+    2: "unknown command",
+    3: "communication error",
+    4: "wrong length",
+    6: "busy",
+    18: "force cannot be read",
+    19: "taxels cannot be read",
+    20: "temperature cannot be read",
+    21: "calibration error",
+    26: "parameters not initialised",
+    28: "over-temperature",
+    29: "mode error",
+    30: "parameter out of range",
+    34: "position sensor error",
+    35: "over-current",
+    36: "still booting",
+    37: "invalid device id",
+    38: "not initialised",
+    39: "open failed",
+    40: "PDO error",
+    41: "SDO error",
+    50: "serial communication error",
+    67: "invalid mode",
+    70: "checksum error",
+    80: "current sensor not zeroed",
+    81: "force mode not supported",
+}
+_PASSING = frozenset({2, 3, 4, 6, 18, 19, 20, 36, 39, 40, 41, 50, 70})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LinkConfig:
+class LinkConfig(Config):
     """The serial line."""
 
     baud: int = setting(3_000_000, unit="1/s", low=1200, high=20_000_000)
@@ -41,7 +70,7 @@ class LinkConfig:
     """First and longest wait between attempts to reconnect; it doubles at each attempt."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "backoff")
 
     def deadline(self, request: int, reply: int) -> float:
@@ -70,6 +99,28 @@ class LinkCounts:
 
 
 @dataclasses.dataclass(frozen=True)
+class Refusal:
+    """Why an exchange was refused, by the hand in an ERROR frame or by the driver."""
+
+    text: str  # for messages
+    serious: bool  # the hand itself is in trouble or is another one, or will never take this command
+
+
+def read_refusal(data: bytes) -> Refusal:
+    """The refusal in the data of an ERROR frame.
+
+    Numbers and names are from the vendor's header; how the frame holds them is not public. Assumed is the full number
+    as four bytes, low byte first, or its last digits alone.
+    """
+    for size in (4, 2, 1):
+        code = int.from_bytes(data[:size], "little")
+        for number in (code - _BASE, code):
+            if len(data) >= size and number in _NAMES:
+                return Refusal(f"the hand reports {_NAMES[number]} ({_BASE + number})", number not in _PASSING)
+    return Refusal(f"the hand reports an unknown error ({data[:8].hex(' ')})", serious=False)
+
+
+@dataclasses.dataclass(frozen=True)
 class Reply:
     """An answered exchange."""
 
@@ -83,12 +134,8 @@ class Reply:
 def checked(reply: Reply, now: float) -> Reply:
     """A reply that the loop can rely on: a driver from elsewhere may have made it.
 
-    Args:
-      reply: of a port.
-      now: s, of the clock that `received` is of. A stamp a little ahead of it becomes `now`: it must grow old.
-
-    Raises:
-      HandError: no reply, its state is none or of another hand, or it was stamped by another clock.
+    A stamp a little ahead of `now` s becomes `now`: it must grow old. Raises HandError: no reply, its state is none or
+    of another hand, or it was stamped by another clock.
     """
     if not isinstance(reply, Reply):
         raise HandError(f"the driver answered with {type(reply).__name__}; expected a `Reply`, or None")
@@ -114,11 +161,7 @@ def refusal_of(port: "HandPort") -> Refusal | None:
 
 
 def greet(port: "HandPort") -> list[str]:
-    """Connect a hand; returns lines for the user: what it is, and the port's warnings.
-
-    Raises:
-      HandError: see `HandPort.connect`.
-    """
+    """Connect a hand; returns lines for the user: what it is, and the port's warnings. HandError: see `HandPort`."""
     line = port.connect()
     warnings = port.warnings() if hasattr(port, "warnings") else []
     return [line, *(f"warning: {warning}" for warning in warnings)]
@@ -128,16 +171,13 @@ class HandPort(Protocol):
     """The interface of a hand. `exchange` is called from one thread only.
 
     A port may also have `warnings()`, lines for the user; `identity`, a `dexsim_real.wire.identity.Identity` or None;
-    and `refusal`, a `dexsim_real.wire.refusals.Refusal` when the newest exchange was refused, else None.
+    and `refusal`, a `Refusal` when the newest exchange was refused, else None.
     """
 
     counts: LinkCounts
 
     def connect(self) -> str:
-        """Open the port and identify the hand. Motors stay off.
-
-        Returns:
-          One line that describes the hand.
+        """Open the port and identify the hand; returns a line that describes it. Motors stay off.
 
         Raises:
           HandError: the port cannot be opened, or the hand does not answer.

@@ -5,20 +5,21 @@
 """
 
 import contextlib
+import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dexsim.core.install import install_line
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain, latency_warnings
+from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
 from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
-from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
-from dexsim_real.wire.refusals import Refusal, read_refusal
+from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Refusal, Reply, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -35,14 +36,11 @@ def passive_command() -> np.ndarray:
 
 
 class SerialHand:
-    """`HandPort` over a serial port.
+    """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
     `refusal` says why the newest request was refused, None if it was not. `identity` is what the hand told about itself
     when it was connected. Another hand on the port is refused: it is told to turn its motors off, and nothing else.
-
-    Args:
-      port: device, by-id link, pseudo-terminal or pyserial URL.
-      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
+    `tap` is called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
     """
 
     def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
@@ -72,9 +70,7 @@ class SerialHand:
             raise
         except OSError as error:
             self.close()
-            raise HandError(
-                f"{self.port}: the connection failed during the handshake ({error}); check the cable"
-            ) from None
+            raise HandError(f"{self.port}: the connection failed in the handshake ({error}); check the cable") from None
         return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
@@ -96,9 +92,16 @@ class SerialHand:
                 self._serial.close()
             self._serial = None
 
-    def warnings(self) -> list[str]:
-        """Settings that slow this port down, with the remedy."""
-        return latency_warnings(self.port)
+    def warnings(self, sysfs: Path = Path("/sys/bus/usb-serial/devices")) -> list[str]:
+        """An FTDI adapter's latency timer of more than 1 ms: at the usual 16 ms the loop runs at half its rate."""
+        timer = sysfs / os.path.basename(os.path.realpath(self.port)) / "latency_timer"
+        value = int(timer.read_text()) if timer.is_file() else 0
+        if value <= 1:
+            return []
+        return [
+            f"{self.port}: the adapter waits {value} ms before it forwards short packets. Set 1 ms now: "
+            f"`echo 1 | sudo tee {timer}`. docs/hardware.md says how to keep it"
+        ]
 
     # --- one exchange ---------------------------------------------------------------------
 
@@ -243,15 +246,8 @@ class SerialHand:
         return None
 
     def _recognise(self) -> None:
-        """Check that the hand is the one from before.
-
-        Raises:
-          HandError: it is another one, or does not tell.
-        """
-        if self.identity == Identity():
-            return
-        identity = self._read_identity()
-        if identity != self.identity:
+        """Raises HandError: the hand is not the one from before, or does not tell."""
+        if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
             text = f"another hand is on {self.port}: {identity.describe()}, not {self.identity.describe()}"
             self.refusal = Refusal(text, serious=True)
             raise HandError(text)
@@ -260,19 +256,13 @@ class SerialHand:
         """Why there is no valid answer, and what to do."""
         config, counts = self.config, self.counts
         if not self._received and not counts.late:
-            why = (
-                "no answer; check the power, the A and B wires of RS485, and that the hand has the id "
-                f"{config.hand_id} (--link.hand-id)"
-            )
+            why = f"no answer; check the power, the A and B wires of RS485, and --link.hand-id (now {config.hand_id})"
         elif self._early:
             why = f"answers arrive sooner than {config.baud} baud allow; use --link.no-paced for an emulated line"
         elif counts.late:
             why = f"answers come too late; raise --link.margin (now {config.margin:g} s), or check the latency timer"
         elif self._others:
-            why = (
-                f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id, and that nothing "
-                "else talks on the line"
-            )
+            why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
         elif self.refusal is not None:
             why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
         elif not self._parser.counts.frames and not self._parser.counts.crc_errors:
@@ -302,15 +292,8 @@ class SerialHand:
 
 
 def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
-    """The hand at a port.
-
-    Args:
-      spec: a serial port, or `sdk:MODULE:FUNCTION` for a function that takes a `LinkConfig` and returns a `HandPort`.
-      config: of the serial line.
-      tap: see `SerialHand`.
-
-    Raises:
-      HandError: the module or function cannot be found.
+    """The hand at a port: a serial port, or `sdk:MODULE:FUNCTION` for a function that takes a `LinkConfig` and returns
+    a `HandPort`. `tap` is that of `SerialHand`. HandError: the module or function cannot be found.
     """
     if not spec.startswith("sdk:"):
         return SerialHand(spec, config, tap=tap)

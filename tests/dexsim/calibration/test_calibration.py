@@ -271,6 +271,20 @@ def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
         load_calibration(tmp_path / "none.toml")
 
 
+@pytest.mark.parametrize(
+    ("entry", "unknown"),
+    [("serial = ", "serail"), ("torque_scale = ", "torque_scales"), ("gain = ", "gian"), ("[end]", "[ende]")],
+)
+def test_an_unknown_entry_is_refused_by_its_name(fitted, tmp_path, entry, unknown):
+    """It would be left out without a word."""
+    path = tmp_path / "c.toml"
+    save_calibration(path, fitted[0])
+    other = f"{unknown}\n{entry}" if entry.startswith("[") else f"{unknown} = 1\n{entry}"
+    path.write_text(path.read_text().replace(entry, other, 1))
+    with pytest.raises(CalibrationError, match=f"unknown entry '{unknown.strip('[]')}'"):
+        load_calibration(path)
+
+
 @pytest.mark.slow
 def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
     from PIL import Image

@@ -166,7 +166,7 @@ def test_the_emulated_hand_is_a_source(hand, monkeypatch):
 
 def test_a_log_is_a_source(tmp_path, monkeypatch):
     pytest.importorskip("serial")
-    monkeypatch.setattr("dexsim_real.run.result.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
     from following_hand import FollowingHand, arguments, records
 
     from dexsim_real.core.log import Kind

@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, joint_labels
@@ -15,8 +13,7 @@ from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Reply
-from dexsim_real.wire.refusals import Refusal, read_refusal
+from dexsim_real.wire.link import LinkCounts, Refusal, Reply, read_refusal
 
 FINGER = ["thumb"] * 3 + ["index"] * 3 + ["middle"] * 2 + ["ring"] * 2 + ["pinky"] * 2
 ON = np.full(12, Mode.POSITION, np.uint8)
@@ -172,14 +169,6 @@ def until_off(bench, read, seconds=10.0, **fields):
     return None
 
 
-def test_encoders_that_are_frozen_are_noticed_within_a_second(bench):
-    frozen = bench.position.copy()
-    assert until_off(bench, lambda true: frozen) < 1.0
-    for _ in range(round(0.3 / CYCLE)):
-        cycle(bench, wave(bench), read=frozen)
-    assert bench.safety.latched.startswith(("no joint angle changes while the commands move", "joint"))
-
-
 def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench):
     """The hand squeezes, or its currents are frozen, too."""
     frozen, start = bench.position.copy(), bench.now
@@ -215,21 +204,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
         seen = bench.position + np.float32(1e-3) * (k % 2)
         decision = cycle(bench, MIDDLE + 0.55 * FREE, read=seen, follow=False, current=np.full(12, 0.8, np.float32))
         assert decision.reaction < Reaction.HOLD, decision.reason
-
-
-BOARDS = {"palm": (12, 0x0101), "joint": (14, 0x0202), "tip": (16, 0x0404)}
-"""Offset of each board's error field in the 24 bytes of a joint, by the vendor's header; a value for the test."""
-
-
-@given(st.sets(st.sampled_from(tuple(BOARDS))), st.integers(0, 11))
-def test_error_fields_are_not_swapped(hand, boards, joint):
-    data = bytearray(frames.empty_state().tobytes())
-    for board in boards:
-        at, value = BOARDS[board]
-        data[24 * joint + at : 24 * joint + at + 2] = value.to_bytes(2, "little")
-    errors = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data))).errors
-    expected = [value if board in boards else 0 for board, (_, value) in BOARDS.items()]
-    assert errors[joint].tolist() == expected and errors.sum() == sum(expected)
 
 
 # --- refusals ------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
-from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -161,7 +160,7 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
     state, step = jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
     controller = Controller(Acts(task, hand, act), hand)
     controller.start(np.asarray(state.joint_target))
-    sensing = HandSensing(hand, HardwareConfig(taxel_floor=0.0))
+    sensing = HandSensing(hand, HardwareConfig())
     at = [f.name for f in controller.policy.observation_layout].index("last_action")
     begin = sum(f.size for f in controller.policy.observation_layout[:at])
     actions, touched = [np.zeros(12, np.float32)], 0
@@ -216,11 +215,6 @@ def test_an_action_that_is_not_finite_counts_as_none(hand):
     np.testing.assert_array_equal(third.action, np.ones(12))  # Clipped, as `Env.step` does.
     inside = np.abs(middle - hand.joint_upper) > 0.4
     np.testing.assert_allclose((third.target - first.target)[inside], 0.2, atol=1e-5)
-
-
-def test_the_shipped_policy_fits_the_bridge(hand):
-    controller = Controller(load_policy("grasp"), hand)
-    assert controller.sources == {"hand", "camera", "user"} and controller.period == pytest.approx(0.03)
 
 
 def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_a_hold(hand):

@@ -7,7 +7,7 @@ import pytest
 
 from dexsim.task_spec import TurnSpec
 from dexsim.tasks.rotate.task import goal_quat
-from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.policy_loop import TurnGoals
 from dexsim_real.sensors.readings import ObjectEstimate
 
 REFERENCE = (0.047, 0.024, 0.088)

@@ -108,7 +108,7 @@ def pose(angle=START):
 @pytest.fixture
 def check(hand):
     """Knows the pose, motors on where the hand is. The newest reading is of time 0."""
-    check = PoseCheck(hand, 0.1)
+    check = PoseCheck(hand)
     for k in range(1 - AGREEING, 1):
         check.judge(k * CYCLE, pose(), None)
     np.testing.assert_array_equal(check.at_rest, pose())
@@ -172,7 +172,7 @@ def test_commands_explain_a_motion_since_the_last_reading_and_not_later(check, w
 @pytest.mark.parametrize("at", [0, 5, 9])
 def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
     """With the motors off; wherever among the last ten the wrong one is, the pose is the median."""
-    check = PoseCheck(hand, 0.1)
+    check = PoseCheck(hand)
     for k in range(AGREEING):
         assert check.at_rest is None
         assert check.judge(k * CYCLE, pose(START + apart * (k == at)), None) == ""
@@ -183,7 +183,7 @@ def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
 
 
 def test_four_equal_wrong_readings_of_ten_do_not_move_the_pose(hand):
-    check = PoseCheck(hand, 0.1)
+    check = PoseCheck(hand)
     for k in range(AGREEING):
         check.judge(k * CYCLE, pose(START + 0.04 * (k in (1, 2, 8, 9))), None)
     np.testing.assert_array_equal(check.at_rest, pose())
@@ -191,7 +191,7 @@ def test_four_equal_wrong_readings_of_ten_do_not_move_the_pose(hand):
 
 @pytest.mark.parametrize("angle", [2.02, -0.11])
 def test_a_reading_outside_the_limits_ends_the_agreement(hand, angle):
-    check = PoseCheck(hand, 0.1)
+    check = PoseCheck(hand)
     for k in range(AGREEING - 1):
         check.judge(k * CYCLE, pose(), None)
     assert "outside its limits" in check.judge(AGREEING * CYCLE, pose(angle), None)
@@ -217,37 +217,45 @@ READING = st.one_of(
     st.tuples(st.integers(0, 11), st.one_of(st.floats(width=32), st.floats(-1.75, 1.75, width=32))),
 )
 TARGET = st.one_of(st.none(), st.floats(width=32), st.lists(st.floats(-3, 3, width=32), min_size=12, max_size=12))
-STEPS = st.lists(
-    st.tuples(READING, TARGET, st.sampled_from([0.0, 30.0]), st.sampled_from([1] * 9 + [2]), st.floats(0.001, 0.2)),
-    max_size=60,
+MEASUREMENT = st.fixed_dictionaries(
+    {
+        "velocity": st.sampled_from([0.0, 5.0, 50.0]),
+        "force": st.sampled_from([0.0, 5.0, 30.0]),
+        "current": st.sampled_from([0.1, 0.1, 3.0]),
+        "temperature": st.sampled_from([30.0] * 9 + [80.0]),
+        "generation": st.sampled_from([1] * 9 + [2]),
+    }
 )
+STEPS = st.lists(st.tuples(READING, TARGET, MEASUREMENT, st.booleans(), st.floats(0.001, 0.2)), max_size=60)
 
 
 @settings(max_examples=150, deadline=None)
 @given(STEPS)
-def test_no_readings_and_targets_make_a_command_jump(hand, steps):
+def test_no_course_of_events_makes_a_command_jump(hand, steps):
     """Finite, within the limits, and at most speed x time from the command before; the first is the measured pose."""
     bench = Bench(hand)
     bench.engage()
     bench.cycle()
     last, before = bench.position, bench.now - CYCLE
-    for reading, target, force, generation, pause in steps:
+    for reading, target, measurement, follow, pause in steps:
         now, position = bench.now, bench.position
         if reading is not None:
             if reading != "true":
                 position = wrong(*reading, position)
             with np.errstate(all="ignore"):
-                bench.safety.see(sample(now, position, force=force, generation=generation))
+                bench.safety.see(sample(now, position, **measurement))
         if target is not None:
             bench.safety.set_target(np.full(12, target) if isinstance(target, float) else np.array(target), now)
         decision = bench.safety.decide(now)
-        assert np.isfinite(decision.position).all()
+        assert np.isfinite(decision.position).all() and decision.mode in (Mode.PASSIVE, Mode.POSITION)
         assert np.all(decision.position >= hand.joint_lower) and np.all(decision.position <= hand.joint_upper)
+        assert not bench.safety.latched or decision.mode == Mode.PASSIVE
         if decision.mode == Mode.POSITION:
             if last is None:  # Motors on: where the hand is.
                 last, before = bench.safety.sample.measured.joint_position.clip(hand.joint_lower, hand.joint_upper), now
             assert np.abs(decision.position - last).max() <= 8.0 * (now - before) + 1e-5
-            last, before, bench.position = decision.position, now, decision.position
+            last, before = decision.position, now
+            bench.position = decision.position if follow else bench.position
         else:
             last = None
         bench.now += pause

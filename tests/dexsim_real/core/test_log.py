@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 import zlib
 
@@ -19,39 +18,22 @@ from paths import ROOT
 from dexsim_real.core.log import _HEAD, MAGIC, SYNC, Kind, LogError, LogReader, LogWriter, encode
 
 
-def contents():
-    rng = np.random.default_rng(0)
-    for i in range(200):
-        yield Kind.RECEIVED, (i, rng.bytes(int(rng.integers(0, 300))))
-        yield Kind.NOTE, f"line {i} with ä"
-        yield (
-            Kind.TICK,
-            {
-                "sequence": i,
-                "readings": {"force": rng.normal(size=(5, 120)).astype(np.float32)},
-                "action": rng.normal(size=12).astype(np.float32),
-                "command": np.float32(0.5),
-            },
-        )
-
-
-def same(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, (np.ndarray, np.generic)):
-        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    return a == b
-
-
 def test_what_goes_in_comes_out_in_order(tmp_path):
-    path = tmp_path / "deep" / "run.log"
+    rng, path = np.random.default_rng(0), tmp_path / "deep" / "run.log"
+    sent = []
+    for k in range(100):
+        tick = {"force": rng.normal(size=(5, 120)).astype(np.float32), "command": np.float32(0.5), "sequence": k}
+        sent += [(Kind.RECEIVED, (k, rng.bytes(k))), (Kind.NOTE, f"line {k} with ä"), (Kind.TICK, tick)]
     with LogWriter(path) as log:
-        for at, (kind, content) in enumerate(contents()):
+        for at, (kind, content) in enumerate(sent):
             log.add(kind, content, when=float(at))
-    records = list(LogReader(path))
-    assert len(records) == 600
-    for at, (record, (kind, content)) in enumerate(zip(records, contents(), strict=True)):
-        assert (record.kind, record.time) == (kind, float(at)) and same(content, record.content)
+    for at, (record, (kind, content)) in enumerate(zip(LogReader(path), sent, strict=True)):
+        assert (record.kind, record.time) == (kind, float(at))
+        if kind == Kind.TICK:
+            for name, value in content.items():
+                np.testing.assert_array_equal(record.content[name], value, strict=name != "sequence")
+        else:
+            assert list(record.content) == list(content)
 
 
 @pytest.fixture(scope="module")
@@ -87,29 +69,22 @@ def test_damage_costs_the_damaged_record_only(small, tmp_path_factory, data):
     assert got <= {f"note {i}" for i in range(20)} and len(got) == 19 and reader.damaged > 0
 
 
-def checked(kind, payload):
-    """A record of any payload, with a right checksum."""
-    check = zlib.crc32(payload, zlib.crc32(_HEAD.pack(SYNC, kind, 0.0, len(payload), 0)))
-    return _HEAD.pack(SYNC, kind, 0.0, len(payload), check) + payload
-
-
 @pytest.mark.parametrize(
-    ("kind", "payload"),
+    "payload",
     [
-        (Kind.NOTE, b"\xff\xfe"),
-        (Kind.RECEIVED, b"abc"),
-        (Kind.META, b"\xc1"),
-        (Kind.META, b"\xdf\xff\xff\xff\xff"),
-        (Kind.META, msgpack.packb([1])),
-        (Kind.TICK, msgpack.packb(5)),
-        (Kind.TICK, msgpack.packb({"a": {"__array__": "O", "shape": [1], "data": b"12345678"}})),
-        (Kind.TICK, msgpack.packb({"a": {"__array__": "<f4", "shape": [99], "data": b"1234"}})),
-        (Kind.TICK, msgpack.packb({"a": {"__array__": "no type", "shape": [1], "data": b"1234"}})),
-        (Kind.TICK, msgpack.packb({"a": {"__array__": "<f4"}})),
+        b"\xc1",
+        b"\xdf\xff\xff\xff\xff",
+        msgpack.packb(5),
+        msgpack.packb([1, 0.0]),
+        msgpack.packb([99, 0.0, "no kind"]),
+        msgpack.packb([4, 0.0, {"a": {"__array__": "O", "shape": [1], "data": b"12345678"}}]),
+        msgpack.packb([4, 0.0, {"a": {"__array__": "<f4", "shape": [99], "data": b"1234"}}]),
+        msgpack.packb([4, 0.0, {"a": {"__array__": "no type", "shape": [1], "data": b"1234"}}]),
     ],
 )
-def test_a_record_that_cannot_be_decoded_counts_as_damage(tmp_path, kind, payload):
-    bad, path = checked(kind, payload), tmp_path / "run.log"
+def test_a_record_that_cannot_be_decoded_counts_as_damage(tmp_path, payload):
+    """With a right checksum."""
+    bad, path = _HEAD.pack(SYNC, len(payload), zlib.crc32(payload)) + payload, tmp_path / "run.log"
     path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + bad + encode(Kind.NOTE, 0.0, "after"))
     reader = LogReader(path)
     assert [record.content for record in reader] == ["before", "after"] and reader.damaged == len(bad)
@@ -121,7 +96,7 @@ def test_a_forged_log_costs_time_in_proportion_to_its_size(tmp_path, monkeypatch
     summed = []
     real = zlib.crc32
     monkeypatch.setattr(zlib, "crc32", lambda data, *start: summed.append(len(data)) or real(data, *start))
-    heads, path = _HEAD.pack(SYNC, Kind.SENT, 1.0, length, 0) * 300_000, tmp_path / "run.log"
+    heads, path = _HEAD.pack(SYNC, length, 0) * 300_000, tmp_path / "run.log"
     path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + heads)
     summed.clear()
     got = []
@@ -129,16 +104,6 @@ def test_a_forged_log_costs_time_in_proportion_to_its_size(tmp_path, monkeypatch
         for record in LogReader(path):
             got.append(record.content)
     assert got == ["before"] and sum(summed) < 6 * path.stat().st_size
-
-
-def test_a_log_with_much_damage_is_read(tmp_path):
-    """A bit flipped in every twentieth record: far from what stops the reader."""
-    rng, path = np.random.default_rng(2), tmp_path / "run.log"
-    records = [bytearray(encode(Kind.RECEIVED, 0.0, (k, rng.bytes(2217)))) for k in range(2000)]
-    for record in records[::20]:
-        record[int(rng.integers(len(record)))] ^= 1 << int(rng.integers(8))
-    path.write_bytes(MAGIC + b"".join(records))
-    assert len(list(LogReader(path))) == 1900
 
 
 def test_files_that_are_no_log(tmp_path):
@@ -176,16 +141,6 @@ def test_a_record_that_cannot_be_written_is_counted_and_costs_no_other(tmp_path)
         log.add(Kind.NOTE, "with it")
     assert "a NOTE record cannot be written" in log.failure and log.dropped == 1
     assert [record.content for record in LogReader(log.path)] == ["before", "with it"]
-
-
-def test_adding_does_not_wait_for_the_disk(tmp_path, monkeypatch):
-    release = threading.Event()
-    monkeypatch.setattr(os, "fdatasync", lambda file: release.wait(30))
-    with LogWriter(tmp_path / "run.log") as log:
-        for i in range(2000):
-            log.add(Kind.RECEIVED, (i, bytes(2217)))
-        release.set()  # Reached while the disk is still waited for.
-    assert len(list(LogReader(tmp_path / "run.log"))) == 2000
 
 
 def test_killed_at_any_moment_all_but_the_last_moment_is_there(tmp_path):

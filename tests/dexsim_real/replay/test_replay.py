@@ -15,7 +15,6 @@ from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
-from dexsim_real.replay.plots import trajectory
 from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
@@ -49,20 +48,20 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
     drawn_by_finger(hand, tmp_path, ticks)
+    shown_in_rerun(hand, tmp_path, ticks)
     taken_along(tmp_path, ticks)
     forged(tmp_path)
     without_frames(tmp_path)
 
 
-def test_rerun_gets_what_the_log_says(tmp_path, monkeypatch):
+def shown_in_rerun(hand, folder, ticks):
+    """The signals and the whole observation."""
     sent = []
-    monkeypatch.setattr("dexsim_real.replay.plots.show_rerun", lambda *parts: sent.append(parts))
-    with FollowingHand() as peer:
-        assert run.main(arguments(peer, tmp_path, "--seconds", "0.3")) == 0
-    ticks = records(tmp_path, Kind.TICK)
-    assert replay_command.main([str(tmp_path / "run.log"), "--rrd", str(tmp_path / "run.rrd")]) == 0
-    ((hand, times, series, taxels, path),) = sent
-    assert path == tmp_path / "run.rrd" and len(times) == len(ticks) == len(taxels)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay_command, "show_rerun", lambda *parts: sent.append(parts))
+        assert replay_command.main([str(folder / "run.log"), "--rrd", str(folder / "run.rrd")]) == 0
+    ((_, times, series, taxels, path),) = sent
+    assert path == folder / "run.rrd" and len(times) == len(ticks) == len(taxels)
     np.testing.assert_array_equal(series["angle"][1], [tick["readings"]["joint_position"] for tick in ticks])
     whole = np.concatenate([values for name, (_, values) in series.items() if "observation/" in name], 1)
     np.testing.assert_array_equal(whole, [tick["observation"] for tick in ticks])
@@ -71,8 +70,14 @@ def test_rerun_gets_what_the_log_says(tmp_path, monkeypatch):
 
 
 def taken_along(folder, ticks):
-    """As data: what each tick read, and the target that followed."""
-    data = trajectory(replay.replay(folder / "run.log"))
+    """As a dataset: what each tick read, and the target that followed."""
+    sent = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay_command, "check_lerobot", lambda path: None)
+        patch.setattr(replay_command, "write_lerobot", lambda *parts: sent.append(parts))
+        assert replay_command.main([str(folder / "run.log"), "--lerobot", str(folder / "data")]) == 0
+    ((path, _, task, (data,)),) = sent
+    assert path == folder / "data" and task == "grasp"
     for name in ("joint_position", "taxel_force", "object_quat", "command"):
         np.testing.assert_array_equal(getattr(data, name), np.float32([tick["readings"][name] for tick in ticks]))
     np.testing.assert_array_equal(data.target, np.float32([tick["target"] for tick in ticks]))
@@ -153,15 +158,6 @@ def without_frames(folder):
                 log.add(record.kind, record.content, record.time)
         code, line = verdict(folder / f"{name}.log")
         assert code == 1 and line.startswith(f"nothing could be compared{says}"), line
-    # The first frames are missing: the rest is compared, and the line says how much is not.
-    ticks = [record.content["sequence"] for record in source if record.kind == Kind.TICK]
-    with LogWriter(folder / "some.log") as log:
-        for record in source:
-            if record.kind not in frames or record.content[0] > ticks[2]:
-                log.add(record.kind, record.content, record.time)
-    code, line = verdict(folder / "some.log")
-    assert (code, line.partition(";")[0]) == (0, "all observations agree to the last bit")
-    assert "; 3 ticks lack their frame" in line
 
 
 @pytest.mark.parametrize("task", ["calibrate", "identify"])

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from paths import ROOT
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
+import dexsim_real
 from dexsim.calibration.maps import save_calibration
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError, DexsimError
@@ -23,10 +25,12 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import limits_for
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogReader
+from dexsim_real.loop import TARE_SAMPLES
 from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.wire.frames import Command, Frame
+from dexsim_real.wire.frames import Command, Frame, empty_state
+from dexsim_real.wire.link import LinkConfig, LinkCounts, Reply
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
@@ -167,7 +171,7 @@ def test_what_is_missing_is_said_in_one_line(tmp_path, capsys, options, says):
         assert not peer.on().any()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])
 def test_signals(tmp_path, number):
     with FollowingHand() as peer:
         command = [sys.executable, "-m", "dexsim_real.run", *arguments(peer, tmp_path, "--seconds", "60")]
@@ -186,18 +190,9 @@ def test_signals(tmp_path, number):
             process.kill()
         time.sleep(0.1)
         on = peer.on()
-    if number == signal.SIGKILL:
-        # Without a guard nobody is left to relax it. The log is whole.
-        assert code == -9
-        ticks = [record.time for record in LogReader(tmp_path / "run.log") if record.kind == Kind.TICK]
-        assert sent - ticks[-1] < 1.0
-        assert replay.replay(tmp_path / "run.log").report["ended"] == "truncated"
-    else:
-        assert code == (130 if number == signal.SIGINT else 128 + number)
-        assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
-        assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in records(tmp_path, Kind.END)[0][
-            "end"
-        ]
+    assert code == 128 + number
+    assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
+    assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in records(tmp_path, Kind.END)[0]["end"]
 
 
 def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
@@ -208,3 +203,100 @@ def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
     for file in (tmp_path / "secret", tmp_path, tmp_path / "none.toml", "/dev/zero"):
         with pytest.raises(ConfigError, match="which is not here: give --hand FILE"):
             recorded_hand(record | {"file": str(file)}, None, "policy.msgpack")
+
+
+# --- as one call -----------------------------------------------------------------------------------
+
+
+def call(peer, folder, **options):
+    return dexsim_real.run_policy(
+        "grasp",
+        peer.port,
+        seconds=0.5,
+        yes=True,
+        fixed_object=True,
+        approach=0.4,
+        guard=False,
+        realtime=False,
+        quiet=True,
+        link=LinkConfig(settle=0.0, paced=False, margin=0.2),
+        safety=SafetyConfig(stale=1.0),
+        log=folder / "run.log",
+        **options,
+    )
+
+
+def test_one_call_runs_a_policy_and_says_how_it_went(tmp_path):
+    with FollowingHand() as peer:
+        result = call(peer, tmp_path, command=0.7)
+        assert peer.on().any() and not peer.on()[-1]
+    assert (result.end, result.code, result.problem) == ("time is over", 0, "") and result.summary["motors_off"]
+    assert result.summary["seconds"] >= 0.5 and result.summary["command"] == 0.7
+    assert result.log == tmp_path / "run.log"
+    ticks = [record for record in LogReader(result.log) if record.kind == Kind.TICK]
+    assert len(ticks) > 5
+
+
+def test_a_wrong_option_moves_nothing(tmp_path):
+    with FollowingHand() as peer:
+        with pytest.raises(ConfigError, match="RunArguments.command = 2"):
+            call(peer, tmp_path, command=2.0)
+        assert not peer.commands
+
+
+# --- over a driver of the user's own ---------------------------------------------------------------
+
+
+class Driver:
+    """Answers until its trouble begins."""
+
+    def __init__(self, trouble, after):
+        self.counts, self.trouble, self.after = LinkCounts(), trouble, after
+
+    def connect(self):
+        return "a hand of mine"
+
+    def exchange(self, command):
+        time.sleep(0.002)
+        self.counts.sent += 1
+        if self.counts.sent > self.after:
+            return self.trouble()
+        now = time.monotonic()
+        return Reply(empty_state(), now, now, self.counts.sent, 1)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """Runs the command over a driver."""
+
+    def start(driver):
+        monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda config: driver))
+        return run.main(arguments(SimpleNamespace(port="sdk:my_sdk"), tmp_path))
+
+    return start
+
+
+def broken():
+    raise RuntimeError("the SDK broke")
+
+
+def misshapen():
+    return Reply(np.zeros(12), 0.0, 0.0, 1, 1)
+
+
+@pytest.mark.parametrize(("trouble", "says"), [(broken, "the SDK broke"), (misshapen, r"state of float64 \[12\]")])
+def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(start, trouble, says):
+    """Not that the hand has stopped answering."""
+    with pytest.raises(HandError, match=f"the exchange thread failed: .*{says}"):
+        start(Driver(trouble, after=TARE_SAMPLES))
+
+
+@pytest.mark.parametrize("code", ["no hand found", 0])
+def test_a_driver_that_exits_is_no_signal_and_no_success(start, tmp_path, monkeypatch, capsys, code):
+    driver = Driver(broken, after=0)
+    monkeypatch.setattr(driver, "connect", lambda: sys.exit(code))
+    assert start(driver) == 1
+    assert capsys.readouterr().err == f"error: a driver exits: {code}\n" and summary(tmp_path)["motors_off"]

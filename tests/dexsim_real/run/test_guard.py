@@ -1,15 +1,11 @@
 """The guard process: a runner that freezes, or that reaches its hand over a port of somebody's own."""
 
-import contextlib
 import os
 import select
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
-from paths import ROOT
 
 pytest.importorskip("serial")
 from following_hand import FollowingHand
@@ -26,47 +22,11 @@ from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
 from dexsim_real.wire.link import LinkCounts, Reply
 
-FREEZE = 4.0  # s, in which a frozen runner's hand must be off: 2 s with this line, the rest for a busy machine
-RUNNER = """
-import sys, time
-from dexsim_real.run.guard import Guard
-from dexsim_real.wire.link import LinkConfig
-guard = Guard(sys.argv[1], LinkConfig(settle=0.0, margin=0.02, handshake=0.1, paced=False))
-guard.arm()
-guard.beat()
-print("armed", flush=True)
-while True:
-    guard.beat()
-    time.sleep(0.01)
-"""
-
 
 @pytest.fixture
 def peer():
     with FollowingHand() as peer:
         yield peer
-
-
-@contextlib.contextmanager
-def guarded(peer):
-    """A runner under guard."""
-    process = subprocess.Popen([sys.executable, "-c", RUNNER, peer.port], cwd=ROOT, stdout=subprocess.PIPE)
-    try:
-        assert process.stdout.readline() == b"armed\n"
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def test_a_frozen_runner_is_killed_and_its_hand_turned_off(peer):
-    with guarded(peer) as process:
-        process.send_signal(signal.SIGSTOP)
-        begin = time.monotonic()
-        assert process.wait(FREEZE) == -signal.SIGKILL
-        while not peer.commands and time.monotonic() < begin + FREEZE:
-            time.sleep(0.01)
-        assert peer.commands and not peer.on().any()
 
 
 @pytest.mark.parametrize("wakes", [True, False])

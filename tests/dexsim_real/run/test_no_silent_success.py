@@ -20,9 +20,9 @@ from dexsim_real.core import log
 from dexsim_real.core.log import LogWriter
 from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
-from dexsim_real.run.outcome import Outcome
+from dexsim_real.run.session import Outcome
 from dexsim_real.sensors.camera import encode_mask
-from dexsim_real.wire.refusals import Refusal
+from dexsim_real.wire.link import Refusal
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 

@@ -89,40 +89,26 @@ def test_current_without_and_with_a_calibration(hand, tmp_path):
     assert measured.taxel_force[0, 0] == pytest.approx(2.0)
 
 
-def test_temperatures_are_of_the_joint_boards_the_tips_and_the_palm(hand):
+def test_temperatures_and_error_bits_are_of_the_right_boards(hand):
+    """Error bits from bytes: in a joint's 24 they are at 12, 14 and 16, of palm, joint and tip."""
     block = state(temperature=(41 << 8) | 56)
     block["tip"]["temperature"] = 33
-    heat = HandSensing(hand, HardwareConfig()).measure(block).temperature
-    np.testing.assert_array_equal(heat, [56] * 12 + [33] * 5 + [41])
-
-
-def test_error_bits_are_of_the_palm_the_joint_and_the_tip(hand):
-    """From bytes: in a joint's 24 they are at 12, 14 and 16."""
-    data = bytearray(state().tobytes())
+    data = bytearray(block.tobytes())
     for joint in range(12):
         for board in range(3):
             data[24 * joint + 12 + 2 * board] = 16 * board + joint + 1
-    errors = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data))).errors
-    np.testing.assert_array_equal(errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
+    measured = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data)))
+    np.testing.assert_array_equal(measured.temperature, [56] * 12 + [33] * 5 + [41])
+    np.testing.assert_array_equal(measured.errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
 
 
-def test_velocity_reported_or_from_differences(hand):
-    reported = HandSensing(hand, HardwareConfig(reported_velocity=True, joint_sign=(-1.0,) + (1.0,) * 11))
-    np.testing.assert_allclose(reported.velocity(state(velocity=1500)), [-1.5] + [1.5] * 11)
-    assert HandSensing(hand, HardwareConfig()).velocity(state()) is None
+def test_velocity_from_differences():
     # A first-order filter: after n steps of h at a constant rate, 1 - (T / (T + h))^n of it is seen.
-    follow = VelocityFilter(0.02)
+    follow = VelocityFilter()
     for n in range(6):
         velocity = follow.update(0.01 * n, np.full(12, 0.03 * n, np.float32))
     np.testing.assert_allclose(velocity, 3.0 * (1 - (2 / 3) ** 5), rtol=1e-4)
     np.testing.assert_array_equal(follow.update(0.05, np.zeros(12, np.float32)), velocity)  # No time has passed.
-
-
-def test_configurations_that_cannot_be():
-    with pytest.raises(HandError, match="11 values for 12 joints"):
-        HardwareConfig(joint_sign=(1.0,) * 11)
-    with pytest.raises(HandError, match="must be 1 or -1"):
-        HardwareConfig(joint_sign=(0.5,) * 12)
 
 
 def test_who_measures_what():

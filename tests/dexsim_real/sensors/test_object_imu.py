@@ -14,6 +14,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.run.options import RunArguments
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.imu import IDENTITY
+from dexsim_real.sensors.object_sensors import ObjectSensors
 
 DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
 
@@ -65,17 +66,6 @@ def test_the_imu_parser_recovers_from_noise(parts, size):
         assert len(found) == 4 and parser.damaged == 0
 
 
-@settings(max_examples=20)
-@given(st.integers(1, 60))
-def test_a_sound_stream_has_no_damaged_frames_however_it_is_cut(size):
-    """All checksums occur in it, the one that looks like half a head too."""
-    frames = [imu.encode(index, quat_of(3 * index, 40, -20)) for index in range(256)]
-    assert {frame[-1] for frame in frames} >= {0xAA}
-    stream, parser = b"".join(frames), imu.RvcParser()
-    found = sum(len(parser.feed(stream[at : at + size])) for at in range(0, len(stream), size))
-    assert (found, parser.damaged) == (256, 0)
-
-
 turns = st.tuples(st.floats(-3, 3), st.floats(-1.2, 1.2), st.floats(-3, 3)).map(
     lambda angles: Rotation.from_euler("zyx", angles)
 )
@@ -93,10 +83,11 @@ def test_one_known_pose_aligns_all_three_angles(world, first, later):
 
 
 def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():
-    """In virtual time: a frame that repeats its index, one damaged sample, and an object that was really exchanged."""
+    """In virtual time: a frame that repeats its index, one damaged sample, and a reference that is lost for good."""
     reader = imu.ImuReader()
     reader.receive(0.0, imu.encode(0, quat_of(0, 0, 0)))
     reader.calibrate(IDENTITY)
+    objects = ObjectSensors(np.zeros(3), None, reader)
     for tick in range(1, 101):
         turned = 0.01 * tick * 90  # degrees: 90 degrees in a second
         index, quat = tick, quat_of(turned, 0, 0)
@@ -108,10 +99,21 @@ def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():
         when, orientation = reader.read()
         expected = 0.9 * min(29 if tick == 30 else tick, 60)
         assert apart(orientation, quat_of(0, 0, 0)) == pytest.approx(math.radians(expected), abs=2e-3)
-    assert when == pytest.approx(0.6)  # `Safety` reacts to its age.
-    for tick in range(101, 107):
+    assert when == pytest.approx(0.6) and objects.lost(1.0, 0.3) == "the IMU is silent"
+    for tick in range(101, 201):
         reader.receive(0.01 * tick, imu.encode(tick, quat_of(54 + 120, 0, 0)))
-    assert apart(reader.read()[1], quat_of(0, 0, 0)) == pytest.approx(math.radians(174), abs=2e-3)
+        assert (objects.lost(0.01 * tick, 9.0) == "the orientation that the IMU sends has jumped") == (tick >= 105)
+    assert apart(reader.read()[1], quat_of(0, 0, 0)) == pytest.approx(math.radians(54), abs=2e-3)
+    reader.receive(2.01, imu.encode(201, quat_of(50, 0, 0)))
+    assert not objects.lost(2.01, 0.3), "it has come back"
+
+
+def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():
+    reader = imu.ImuReader()
+    for tick in range(10):
+        reader.receive(0.01 * tick, imu.encode(tick, quat_of(100 * (tick > 0), 0, 0)))
+    reader.calibrate(IDENTITY)
+    assert not reader.jumped and reader.read()[0] == pytest.approx(0.09)
 
 
 def test_a_mount_without_a_length_is_refused():

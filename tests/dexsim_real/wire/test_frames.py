@@ -114,79 +114,9 @@ def test_a_host_does_not_take_its_own_echo_for_an_answer():
     assert len(Parser(HOST_REQUESTS).feed(echo)) == 4
 
 
-def damage(rng, sent):
-    """One frame's bytes after one fault, the whole frame nowhere among them."""
-    while sent in (bad := _damage(rng, bytearray(sent))):
-        pass
-    return bad
-
-
-def _damage(rng, data):
-    at = int(rng.integers(len(data)))
-    kind = rng.integers(6)
-    if kind == 0:  # up to three flipped bits
-        for bit in rng.choice(8 * len(data), int(rng.integers(1, 4)), replace=False):
-            data[bit >> 3] ^= 1 << (bit & 7)
-    elif kind == 1:  # lost bytes
-        del data[at : at + int(rng.integers(1, 40))]
-    elif kind == 2:  # doubled bytes
-        data[at:at] = data[at : at + int(rng.integers(1, 40))]
-    elif kind == 3:  # cut off
-        del data[at:]
-    elif kind == 4:  # strange bytes within
-        data[at:at] = rng.bytes(int(rng.integers(1, 60)))
-    else:  # overwritten in two bytes: a burst that the checksum is sure to find
-        first = bytes(data[at : at + 2])
-        while bytes(data[at : at + 2]) == first:
-            data[at : at + 2] = rng.bytes(len(first))
-    return bytes(data)
-
-
 HEADS = tuple(
     bytes.fromhex(text) for text in ("55", "AA", "55AA", "55AAFE", "55AA80FE02A008", "55AAFE80022001", "55AA80FE021020")
 )
-
-
-def between(rng):
-    """What lies between two frames: nothing, noise, or what looks like the beginning of a frame."""
-    kind = rng.integers(4)
-    return b"" if kind < 2 else rng.bytes(int(rng.integers(1, 30))) if kind == 2 else HEADS[rng.integers(len(HEADS))]
-
-
-def fuzz(seed, total, lengths, make):
-    """Feed at least `total` bytes of whole and damaged frames; check what comes out.
-
-    Every intact frame must come out, in order, before the frame after the next has been fed; nothing else may.
-    """
-    rng = np.random.default_rng(seed)
-    parser, fed, waiting, wrong = Parser(lengths), 0, [], []
-    longest = frames.OVERHEAD + max(span[-1] for span in lengths.values())
-    overhang = 0  # bytes fed since the oldest waiting frame ended
-    while fed < total:
-        sent = make(rng)
-        data = sent.encode()
-        intact = rng.random() < 0.6
-        stream = between(rng) + (data if intact else damage(rng, data))
-        if intact:
-            waiting.append(sent)
-        fed += len(stream)
-        overhang = overhang + len(stream) if len(waiting) > intact else 0
-        while stream:
-            size = int(rng.choice([1, 7, 62, 512, 4096]))
-            for frame in parser.feed(stream[:size]):
-                if waiting and frame == waiting[0]:
-                    waiting.pop(0)
-                    overhang = 0
-                else:
-                    wrong.append(frame)
-            stream = stream[size:]
-        assert overhang <= longest, "an intact frame is held back for more than a frame"
-        assert parser.pending < longest
-    for frame in parser.expire():
-        assert waiting and frame == waiting.pop(0)
-    assert not wrong and not waiting
-    assert parser.counts.received == fed
-    return parser.counts
 
 
 def command_frame(rng):
@@ -194,22 +124,43 @@ def command_frame(rng):
     return Frame(frames.HOST, 0x80, Command.EXCHANGE, block.tobytes())
 
 
-@settings(max_examples=10)
-@given(st.integers(0, 2**31))
-def test_damage_costs_only_the_damaged_frames(seed):
-    assert fuzz(seed, 40_000, HAND_REPLIES, state_frame).resyncs > 0
+def damaged(rng, sent):
+    """A frame with flipped bits, lost, doubled or strange bytes, or cut off."""
+    data = bytearray(sent)
+    at, size = int(rng.integers(len(data))), int(rng.integers(1, 40))
+    kind = rng.integers(5)
+    if kind == 0:
+        data[at] ^= int(rng.integers(1, 256))
+    elif kind == 1:
+        del data[at : at + size]
+    elif kind == 2:
+        data[at:at] = data[at : at + size]
+    elif kind == 3:
+        del data[at:]
+    else:
+        data[at:at] = rng.bytes(size)
+    return b"" if bytes(data) == sent or sent in data else bytes(data)
 
 
-@settings(max_examples=60)
-@given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from(HEADS)), max_size=40), st.integers(1, 20))
-def test_noise_alone_is_nothing_and_hides_nothing(parts, size):
-    noise = b"".join(parts)
-    sent = Frame(0x80, 0xFE, Command.VERSION, b"1.3.9")
-    parser = Parser(HAND_REPLIES)
-    stream = noise + sent.encode()
-    got = [frame for i in range(0, len(stream), size) for frame in parser.feed(stream[i : i + size])]
-    assert got + parser.expire() == [sent]
-    assert parser.pending == 0 and parser.counts.skipped == len(noise)
+@settings(max_examples=30)
+@given(st.integers(0, 2**31), st.sampled_from([(HAND_REPLIES, state_frame), (HOST_REQUESTS, command_frame)]))
+def test_damage_costs_only_the_damaged_frames(seed, end):
+    """Every intact frame comes out, in order, not much later than it was fed; nothing else does."""
+    lengths, make = end
+    rng, parser, sent, received, fed = np.random.default_rng(seed), Parser(lengths), [], [], 0
+    longest = frames.OVERHEAD + max(span[-1] for span in lengths.values())
+    for _ in range(40):
+        frame = make(rng)
+        noise = (b"", rng.bytes(int(rng.integers(1, 30))), HEADS[rng.integers(len(HEADS))])[rng.integers(3)]
+        intact = rng.random() < 0.6
+        sent += [frame] * intact
+        stream = noise + (frame.encode() if intact else damaged(rng, frame.encode()))
+        fed += len(stream)
+        size = int(rng.choice([7, 62, 512, 4096]))
+        for at in range(0, len(stream), size):
+            received += parser.feed(stream[at : at + size])
+        assert parser.pending < longest and received == sent[: len(received)]
+    assert received + parser.expire() == sent and parser.counts.received == fed
 
 
 def test_the_worst_stream_costs_bounded_work():
@@ -221,10 +172,3 @@ def test_the_worst_stream_costs_bounded_work():
         assert parser.pending <= 2217 + 512
     parser.expire()
     assert parser.counts.checked <= len(stream) * 2217 / 7
-
-
-def test_a_million_bytes_of_damage():
-    state = fuzz(20, 900_000, HAND_REPLIES, state_frame)
-    command = fuzz(21, 100_000, HOST_REQUESTS, command_frame)
-    assert state.received + command.received >= 1_000_000
-    assert state.checked < 3 * state.received and command.checked < 3 * command.received

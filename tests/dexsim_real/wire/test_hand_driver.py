@@ -1,5 +1,6 @@
 """The driver with a scripted hand on a pseudo-terminal: faults, late answers, reconnection."""
 
+import contextlib
 import dataclasses
 import os
 import threading
@@ -19,6 +20,18 @@ serial = pytest.importorskip("serial")
 
 def command(position=0.5):
     return frames.command_block(np.full(12, position), kp=100, ki=0, kd=0, torque_max=300)
+
+
+@contextlib.contextmanager
+def opened(answer=None, config=QUICK, **options):
+    """A scripted hand and the driver whose port is open."""
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, config, **options)
+        port._open()
+        try:
+            yield peer, port
+        finally:
+            port.close()
 
 
 def outcomes(counts):
@@ -110,15 +123,12 @@ def test_a_late_answer_is_thrown_away():
         if index == 1:
             time.sleep(0.25)
 
-    with PtyHand(answer) as peer:
-        port = SerialHand(peer.port, QUICK)
-        port.connect()
+    with opened(answer) as (_, port):
+        assert port.exchange(command()) is not None
         assert port.exchange(command()) is None
         time.sleep(0.4)  # Now it is there, and must not pass for the answer to the next request.
-        reply = port.exchange(command())
-        assert reply.state["joint"]["position"][0] == 2
+        assert port.exchange(command()).state["joint"]["position"][0] == 2
         assert (port.counts.silent, port.counts.late) == (1, 1)
-        port.close()
 
 
 def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request():
@@ -131,16 +141,11 @@ def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request():
         else:
             time.sleep(0.25)
 
-    with PtyHand(answer) as peer:
-        # 2514 bytes take 0.218 s at this rate.
-        config = dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True)
-        port = SerialHand(peer.port, config, tap=lambda way, data: port.counts.sent == 2 and asked.set())
-        port._open()
+    config = dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True)  # 2514 bytes take 0.218 s.
+    with opened(answer, config, tap=lambda way, data: port.counts.sent == 2 and asked.set()) as (_, port):
         assert port.exchange(command()) is None
-        reply = port.exchange(command())
-        assert reply is not None and reply.state["joint"]["position"][0] == 1
+        assert port.exchange(command()).state["joint"]["position"][0] == 1
         assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
-        port.close()
 
 
 def test_of_two_answers_at_once_the_newer_is_taken():
@@ -150,9 +155,7 @@ def test_of_two_answers_at_once_the_newer_is_taken():
         state["joint"]["position"] = 2
         return older + peer.whole()
 
-    with PtyHand(answer) as peer:
-        port = SerialHand(peer.port, QUICK)
-        port._open()
+    with opened(answer) as (peer, port):
         read = port._read
 
         def both():
@@ -164,13 +167,10 @@ def test_of_two_answers_at_once_the_newer_is_taken():
         port._read = both
         assert port.exchange(command()).state["joint"]["position"][0] == 2
         assert port.counts == LinkCounts(sent=1, answered=1, late=1)
-        port.close()
 
 
 def test_a_line_that_never_falls_silent_does_not_hold_the_driver():
-    with PtyHand() as peer:
-        port = SerialHand(peer.port, QUICK)
-        port._open()
+    with opened() as (peer, port):
         stop = threading.Event()
 
         def babble():
@@ -182,17 +182,14 @@ def test_a_line_that_never_falls_silent_does_not_hold_the_driver():
         port.exchange(command())  # It returns.
         stop.set()
         thread.join()
-        port.close()
 
 
 def test_a_port_that_fails_while_greeting_is_counted(monkeypatch):
-    with PtyHand() as peer:
-        port = SerialHand(peer.port, QUICK)
+    def fail(*_):
+        raise OSError("unplugged")
+
+    with opened() as (_, port):
         port.connect()
-
-        def fail(*_):
-            raise OSError("unplugged")
-
         monkeypatch.setattr(port, "_wait", fail)
         assert port.exchange(command()) is None
         time.sleep(0.03)
@@ -202,7 +199,6 @@ def test_a_port_that_fails_while_greeting_is_counted(monkeypatch):
         assert port.exchange(command()) is not None
         assert (port.counts.lost, port.counts.reconnects) == (2, 1)
         assert port.counts.sent == sum(outcomes(port.counts).values())
-        port.close()
 
 
 def test_the_hand_goes_and_comes_back():

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from pty_hand import QUICK, PtyHand
 
-from dexsim_real.core.errors import HandError, explain, latency_warnings
+from dexsim_real.core.errors import HandError, explain
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.wire.frames import STATE_BLOCK, Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig, Reply, checked, greet, refusal_of
-from dexsim_real.wire.refusals import Refusal
+from dexsim_real.wire.link import LinkConfig, Refusal, Reply, checked, greet, refusal_of
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 serial = pytest.importorskip("serial")
@@ -29,7 +28,7 @@ OTHER = Frame(0x81, 0xFE, Command.EXCHANGE, empty_state().tobytes()).encode()
         (b"", "no answer.*power"),
         (b"\x13\x37" * 40, "--link.baud .*3000000 baud"),
         (ERROR, "unknown command .1501002.; power-cycle"),
-        (OTHER, "no hand with the id 0; .*--link.hand-id"),
+        (OTHER, "no hand with the id 0; check --link.hand-id"),
     ],
 )
 def test_why_a_hand_does_not_answer(answer, says):
@@ -138,10 +137,11 @@ def test_the_latency_timer(tmp_path):
     device = tmp_path / "by-id"
     device.symlink_to("/dev/ttyUSB7")
     timer.write_text("16\n")
-    (text,) = latency_warnings(str(device), tmp_path)
+    port = SerialHand(str(device))
+    (text,) = port.warnings(tmp_path)
     assert f"echo 1 | sudo tee {timer}" in text and "16 ms" in text
     timer.write_text("1\n")
-    assert latency_warnings(str(device), tmp_path) == latency_warnings("/dev/ttyACM0", tmp_path) == []
+    assert port.warnings(tmp_path) == SerialHand("/dev/ttyACM0").warnings(tmp_path) == []
 
 
 def test_the_deadline_follows_size_and_baud():
