@@ -10,7 +10,7 @@ Names are imported at first use, so that a program that only runs a policy loads
 
 from typing import TYPE_CHECKING
 
-from dexsim.core.door import open_door
+from dexsim.core.lazy_loading import lazy_exports
 
 if TYPE_CHECKING:
     from dexsim.core.cli import enable_caches
@@ -57,7 +57,7 @@ __all__ = [
     "take_snapshot",
 ]
 
-__getattr__, __dir__ = open_door(
+__getattr__, __dir__ = lazy_exports(
     __name__,
     __all__,
     {

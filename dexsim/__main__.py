@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 
 from dexsim.core import cli
-from dexsim.core.door import begin_loading, end_loading
 from dexsim.core.errors import ConfigError
+from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
 
 COMMANDS = {
     "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
@@ -49,9 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
     if name == "train":
         cli.announce(cli.LOADING)
-    begin_loading()
+    exit_on_interrupt()
     module = importlib.import_module(COMMANDS[name][0])
-    end_loading()
+    restore_interrupt()
     return module.main(rest)
 
 

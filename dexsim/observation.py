@@ -54,6 +54,7 @@ class Motion:
 class Features:
     """What the fields are made of, computed once from the readings."""
 
+    hand: Hand
     readings: Readings
     encoding: str  # of orientations, see `ObservationConfig.orientation`
     contact_force: jax.Array  # [F] N
@@ -66,7 +67,7 @@ class Features:
 
 @dataclasses.dataclass(frozen=True)
 class ObservationField:
-    """A named piece of an observation: all there is to know about it."""
+    """A named piece of an observation, a row of `_FIELDS`: all there is to know about it."""
 
     name: str
     size: Callable[[Hand, str], int]
@@ -130,7 +131,7 @@ _FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], 
     ("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin, None),
 )
 FIELDS: dict[str, ObservationField] = {row[0]: ObservationField(*row) for row in _FIELDS}
-"""Every field by name. A field of one's own is one more entry."""
+"""Every field by name; a row of `_FIELDS` each."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -227,6 +228,7 @@ def observe(
         pose = forward_kinematics(hand, readings.joint_position)
     force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
+        hand=hand,
         readings=readings,
         encoding=config.orientation,
         contact_force=force,

@@ -9,7 +9,7 @@ Names are imported at first use: loading a policy loads neither MuJoCo nor MJX.
 
 from typing import TYPE_CHECKING
 
-from dexsim.core.door import open_door
+from dexsim.core.lazy_loading import lazy_exports
 
 if TYPE_CHECKING:
     from dexsim_ppo.evaluate import evaluate_policy
@@ -31,7 +31,7 @@ __all__ = [
     "train_policy",
 ]
 
-__getattr__, __dir__ = open_door(
+__getattr__, __dir__ = lazy_exports(
     __name__,
     __all__,
     {

@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Average the weights of policies that were fine-tuned from one, or of one run's checkpoints.",
     )
     cli.check_writable(arguments.output)
-    cli.check_apart({"--output": arguments.output}, {f"policy {name}": name for name in arguments.policies})
+    cli.check_no_overwrite({"--output": arguments.output}, {f"policy {name}": name for name in arguments.policies})
     policies = [load_policy(name) for name in arguments.policies]
     average = average_policies(policies)
     average.save(arguments.output)

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from dexsim.core.errors import CheckpointError
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim_ppo.portable import FORMAT_VERSION, MAGIC, PREFIX, digest, read_file
 
 Tree = TypeVar("Tree")
@@ -44,7 +44,7 @@ def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], 
         leaves.append({"path": name, "dtype": array.dtype.name, "shape": list(array.shape), "prng": prng})
     header = msgpack.packb({"kind": kind, "task": task, "content": dict(content), "leaves": leaves})
     prefix = PREFIX.pack(MAGIC, FORMAT_VERSION, len(header))
-    write_whole(Path(path), [prefix, digest(prefix, header, *parts), header, *parts])
+    write_atomic(Path(path), [prefix, digest(prefix, header, *parts), header, *parts])
 
 
 def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:

@@ -77,7 +77,7 @@ class Evaluator:
         """One chunk: what the report needs, and snapshots and termination flags [T, shown].
 
         The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
-        own totals, only the metrics of each one's last tick [chunk] and the ticks it lived [chunk].
+        own totals, only the metrics of each one's last tick [chunk] and the ticks it lasted [chunk].
         """
         state = self.protocol.evaluation_starts(plan)
         shown = self._extremes(state)
@@ -117,11 +117,11 @@ class Evaluator:
 
 
 def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
-    """`last` (metrics, ticks lived, whether ended), one tick later; an ended episode stays as it is."""
-    before, lived, ended = last
+    """`last` (metrics, episode length, whether ended), one tick later; an ended episode stays as it is."""
+    before, episode_length, ended = last
     latest = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
     ended = ended | terminated
-    return latest, lived + (~ended).astype(jnp.int32), ended
+    return latest, episode_length + (~ended).astype(jnp.int32), ended
 
 
 def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:
@@ -244,7 +244,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in (arguments.output, video):
         if path:
             cli.check_writable(path)
-    cli.check_apart({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
+    cli.check_no_overwrite({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim.core.install import require
 from dexsim_ppo.policy import Policy, load_policy
 
@@ -78,7 +78,7 @@ def to_onnx(policy: Policy, path: Path) -> None:
     header = json.dumps({"task": policy.task} | cli.plain(policy.header()))
     helper.set_model_props(model, {_KEY: header})
     checker.check_model(model)
-    write_whole(path, [model.SerializeToString()])
+    write_atomic(path, [model.SerializeToString()])
 
 
 def _onnx_gru(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

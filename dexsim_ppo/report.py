@@ -28,18 +28,20 @@ def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, 
     }
 
 
-def summarize_totals(env: Any, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
-    held = lived == env.evaluation_steps
+def summarize_totals(
+    env: Any, metrics: dict[str, np.ndarray], episode_length: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from the metrics of their last tick [N], their lengths [N] in ticks and their starts [N]."""
+    held = episode_length == env.evaluation_steps
     return {
-        "episodes": int(lived.size),
+        "episodes": int(episode_length.size),
         "steps": env.evaluation_steps,
-        **_intervals(held, metrics["return"], lived, start),
-        "task": env.summarize(metrics, lived),
+        **_intervals(held, metrics["return"], episode_length, start),
+        "task": env.summarize(metrics, episode_length),
     }
 
 
-def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
+def _intervals(held: np.ndarray, returns: np.ndarray, episode_length: np.ndarray, start: np.ndarray) -> dict[str, Any]:
     """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
     starts, share = len(np.unique(start)), mean_interval(held, start)
     if starts == held.size:
@@ -49,7 +51,7 @@ def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: 
         "starts": starts,
         "held": share | {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)},
         "return": mean_interval(returns, start),
-        "steps_held": mean_interval(lived, start),
+        "steps_held": mean_interval(episode_length, start),
     }
 
 

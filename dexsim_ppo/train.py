@@ -140,7 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         stopped = train_run(run, source, command)
     if not stopped:
         return 0
-    processes.say(
+    processes.print_on_first(
         f"stopped by {signal.Signals(stopped).name}; resume with: "
         f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}{task_option(arguments.task)}"
     )
@@ -158,9 +158,11 @@ def make_run(arguments: TrainArguments, source: Source, started: float, command:
     if arguments.wandb:
         require("wandb", "wandb", f"--wandb {arguments.wandb}")
     if arguments.deterministic and not make_deterministic():
-        processes.say("--deterministic changes nothing here: without a GPU, runs repeat to the last bit anyway")
+        processes.print_on_first(
+            "--deterministic changes nothing here: without a GPU, runs repeat to the last bit anyway"
+        )
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, source)
-    processes.say(f"making the environment of {arguments.task}")
+    processes.print_on_first(f"making the environment of {arguments.task}")
     made = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend, hand=hand)
     env = adapt(made, arguments.task)
     if env.backend != "own":  # so that a resumed run has the same engine

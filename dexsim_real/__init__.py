@@ -6,7 +6,7 @@ nor MJX, and pyserial only where a port is opened. Names are imported at first u
 
 from typing import TYPE_CHECKING
 
-from dexsim.core.door import open_door
+from dexsim.core.lazy_loading import lazy_exports
 
 if TYPE_CHECKING:
     from dexsim_real.control.controller import Controller
@@ -30,7 +30,7 @@ __all__ = [
     "run_policy",
 ]
 
-__getattr__, __dir__ = open_door(
+__getattr__, __dir__ = lazy_exports(
     __name__,
     __all__,
     {

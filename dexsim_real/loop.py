@@ -97,7 +97,7 @@ class ExchangeLoop:
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)
-        plausible = self.safety.see(sample)
+        plausible = self.safety.update(sample)
         if plausible:
             self._filter.update(sample.time, sample.measured.joint_position)
         return Exchange(decision, sample, reply.state, plausible)

@@ -15,7 +15,7 @@ import numpy as np
 from dexsim.core.assets import asset_path
 from dexsim.core.ranges import uniform
 from dexsim.hand.kinematics import Hand
-from dexsim.objects.config import BULK_RANGES, INACTIVE_SIZE, SHAPES
+from dexsim.objects.config import INACTIVE_SIZE, PROPERTY_RANGES, SHAPES
 from dexsim.objects.params import ObjectParams, sample_object
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
@@ -67,7 +67,7 @@ class HeldOutGrasp(Grasp):
         self.largest = self._table["size"].max(0)
         self._mass = np.array([HEAVY.get(name, config.objects.mass) for name in names], np.float32)
         # Mass stays as the pool has it, since heavy objects have a range of their own.
-        self.object_ranges = tuple(f"objects.{name}" for name in BULK_RANGES if name != "mass")
+        self.object_ranges = tuple(f"objects.{name}" for name in PROPERTY_RANGES if name != "mass")
 
     @property
     def drawn_shapes(self) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import CalibrationError
-from dexsim.core.files import read_toml, write_whole
+from dexsim.core.files import read_toml, write_atomic
 from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.kinematics import Hand
 
@@ -176,7 +176,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         lines += [f"{field} = {_text(values)}" for field, values in vars(side).items()]
     lines += ["[end]", "complete = true", ""]
     try:
-        write_whole(Path(path), ["\n".join(lines).encode()])
+        write_atomic(Path(path), ["\n".join(lines).encode()])
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
 

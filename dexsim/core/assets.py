@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import AssetError
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -55,5 +55,5 @@ def cached_arrays(folder: str, key: str, make: Callable[[], Mapping[str, Any]]) 
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     with contextlib.suppress(OSError):  # a cache that cannot be written is no error
-        write_whole(path, [buffer.getbuffer()])
+        write_atomic(path, [buffer.getbuffer()])
     return arrays

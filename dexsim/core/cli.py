@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.door import end_loading
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
-from dexsim.core.files import is_device, make_private, write_whole
+from dexsim.core.files import is_device, make_private, write_atomic
 from dexsim.core.install import DISTRIBUTION
+from dexsim.core.lazy_loading import restore_interrupt
 
 T = TypeVar("T")
 
@@ -28,7 +28,7 @@ LOADING = "loading JAX and MuJoCo"
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
     warnings.showwarning = _show_warning
-    end_loading()
+    restore_interrupt()
     try:
         code = main(None)
     except DexsimError as error:
@@ -135,7 +135,7 @@ def check_writable(path: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
 
 
-def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
+def check_no_overwrite(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
     """Check that no file which a command writes (by option) is one that it reads (by what that is), or another one that
     it writes.
 
@@ -152,7 +152,7 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | P
 
 def write_json(path: Path, data: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    write_whole(path, [(json.dumps(plain(data), indent=1) + "\n").encode()])
+    write_atomic(path, [(json.dumps(plain(data), indent=1) + "\n").encode()])
 
 
 def plain(value: Any) -> Any:

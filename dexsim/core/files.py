@@ -12,7 +12,7 @@ from typing import Any
 _SMALL = 1 << 20  # bytes
 
 
-def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
+def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
     """Write `chunks` one after another to `path`, and create its folder if needed.
 
     They go to a temporary file beside it, which is renamed once everything is on the disk. So neither a crash nor

@@ -1,6 +1,6 @@
 """The environment: parts composed into pure `reset` and `step` functions.
 
-    action -> control -> motors' law -> physics -> ground truth -> senses -> observation -> task (reward, end)
+    action -> control -> motors' law -> physics -> ground truth -> sensors -> observation -> task (reward, end)
 
 All functions are written for one environment and vmapped by the caller. The state is a frozen pytree of arrays; there
 is no hidden state and no automatic reset: `step` returns the true final observation, and `restart` puts a new episode
@@ -22,7 +22,7 @@ from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
 from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.env.observer import Observer
-from dexsim.env.senses import SensorInput, SensorSuite
+from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.env.touch import TouchModel
@@ -58,9 +58,9 @@ class Env:
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
         self.touch = TouchModel(config, hand)
-        self.senses = SensorSuite(config, hand, task)
+        self.sensors = SensorSuite(config, hand, task)
         self.observer = Observer(config, hand, task)
-        self.sampler = EpisodeSampler(config, hand, task, self.senses)
+        self.sampler = EpisodeSampler(config, hand, task, self.sensors)
         self.observation_layout = self.observer.layout
         self.control_period = config.physics.control_period
         """One control tick, s."""
@@ -187,7 +187,7 @@ class Env:
         pose = forward_kinematics(self.hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        touch, normal_force, skin_force = self.touch.feel(pose, object, position, rotation, force, delta)
+        touch, normal_force, skin_force = self.touch.compute(pose, object, position, rotation, force, delta)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -218,10 +218,10 @@ class Env:
     ) -> dict[str, Any]:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
-        now, shown = self.senses.input(truth), self.task.goal_readings(goal)
+        now, shown = self.sensors.input(truth), self.task.goal_readings(goal)
         before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, taxel_memory = self.senses.read(key, episode, now, before, shown, action, last)
+        readings, taxel_memory = self.sensors.read(key, episode, now, before, shown, action, last)
         correction = None if last is None else last.correction
         if self.spec.force_loop:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)

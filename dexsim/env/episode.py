@@ -1,4 +1,4 @@
-"""What an episode draws at its start: the hand, the object's bulk, the IMU and the taxels."""
+"""What an episode draws at its start: the hand, the object's properties, the IMU and the taxels."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,12 @@ import numpy as np
 
 from dexsim.core.ranges import sample_extreme
 from dexsim.env.config import EnvConfig
-from dexsim.env.senses import SensorSuite
+from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Episode
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
-from dexsim.objects.config import BULK_RANGES
-from dexsim.objects.params import ObjectParams, redraw_bulk, toward_nominal
+from dexsim.objects.config import PROPERTY_RANGES
+from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.randomization import sample_hand, tilted_down
 from dexsim.sensing.imu import sample_imu
 
@@ -19,9 +19,9 @@ from dexsim.sensing.imu import sample_imu
 class EpisodeSampler:
     """Draws an `Episode`. Pure methods, for one environment."""
 
-    def __init__(self, config: EnvConfig, hand: Hand, task: Task, senses: SensorSuite):
-        self.config, self.hand, self.task, self.senses = config, hand, task, senses
-        self._bulk = tuple(name for name in BULK_RANGES if f"objects.{name}" in task.object_ranges)
+    def __init__(self, config: EnvConfig, hand: Hand, task: Task, sensors: SensorSuite):
+        self.config, self.hand, self.task, self.sensors = config, hand, task, sensors
+        self._drawn = tuple(name for name in PROPERTY_RANGES if f"objects.{name}" in task.object_ranges)
         self._weight = float(np.linalg.norm(task.gravity))  # m/s^2
         self._down = np.asarray(task.gravity, float) / np.linalg.norm(task.gravity)
 
@@ -42,9 +42,9 @@ class EpisodeSampler:
           scale: [] in [0, 1], narrows every range about nominal; None for 1.
         """
         config, ranges, period = self.config, self.config.randomization, self.config.physics.control_period
-        if self._bulk:
+        if self._drawn:
             plain = self.task.unit_inertia(object)
-            object = redraw_bulk(object_key, object, config.objects, plain, self._bulk)
+            object = resample_properties(object_key, object, config.objects, plain, self._drawn)
         if scale is not None:
             object = toward_nominal(object, config.objects, self.task.unit_inertia(object), scale)
         width = 1.0 if scale is None else scale
@@ -54,7 +54,7 @@ class EpisodeSampler:
             hand=sample_hand(hand_key, ranges, self.hand, **times, scale=width),
             object=object,
             imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
-            taxels=self.senses.taxels.sample(jax.random.fold_in(sensor_key, 1), width),
+            taxels=self.sensors.taxels.sample(jax.random.fold_in(sensor_key, 1), width),
         )
 
     def tilt_force(self, episode: Episode) -> jax.Array:

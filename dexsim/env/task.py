@@ -21,7 +21,7 @@ from dexsim.objects import params
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import FIELDS
 from dexsim.task_spec import TurnSpec
-from dexsim.touch.feel import Touch
+from dexsim.touch.taxel_force import Touch
 
 
 @pytree_dataclass
@@ -89,8 +89,8 @@ class Task(abc.ABC):
     evaluation: str
     """What `summarize` is given: "series" or "totals"."""
     object_ranges: tuple[str, ...]
-    """Paths in `config` of the ranges that `sample_object` draws from. Those of the object's bulk among them, such as
-    "objects.mass", are drawn anew at every episode start; the others stay as the pool has them."""
+    """Paths in `config` of the ranges that `sample_object` draws from. Those of `PROPERTY_RANGES`, as "objects.mass",
+    are drawn anew at every episode start; the others stay as the pool has them."""
     config: EnvConfig
     """An `EnvConfig` or a subclass with settings of the task's own."""
     posture: tuple[float, ...] = ()

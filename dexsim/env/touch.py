@@ -9,8 +9,8 @@ from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.objects.params import ObjectParams
 from dexsim.objects.touch_geometry import touch_geometry
-from dexsim.touch.feel import Touch, feel_links, keep_normal_part
 from dexsim.touch.surface import skin_surface, taxels_only, whole_surface
+from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals
 
 
 class TouchModel:
@@ -26,7 +26,7 @@ class TouchModel:
         same_rubber = skin.margin == config.physics.pad_thickness
         self._shared = config.touch_method == "closed_form" and not skin.untaxelled and same_rubber
 
-    def feel(
+    def compute(
         self,
         pose: HandPose,
         object: ObjectParams,
@@ -35,7 +35,7 @@ class TouchModel:
         force: jax.Array,
         pad_thickness_delta: jax.Array | float = 0.0,
     ) -> tuple[Touch, jax.Array, jax.Array]:
-        """What the fingertips feel in a tick.
+        """What presses on the fingertips in a tick.
 
         Args:
           pose: of the hand.
@@ -49,16 +49,16 @@ class TouchModel:
         """
         hand, skin, place = self.hand, self.config.skin, (position, rotation)
         surface, geometry = self._surface, self.geometry(object)
-        touch = feel_links(hand, pose, geometry, *place, length(force), skin, surface, pad_thickness_delta)
+        touch = compute_touch(hand, pose, geometry, *place, length(force), skin, surface, pad_thickness_delta)
         # In the links' frames, where the normals are constants.
         local = rotations.rotate_inverse(pose.tip_rotation, force)
-        pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
+        pressed = project_on_normals(touch, jnp.asarray(surface.normal), local)
         normal = jnp.sum(pressed.force, -1)
         touch = pressed if skin.total == "pressing" else touch
         if self._shared:
             return touch, normal, jnp.sum(touch.skin_force, -1)
         delta = jnp.maximum(pad_thickness_delta, -self.config.physics.pad_thickness)  # the solver's
         unit = jnp.ones(hand.num_fingers)
-        bearing = feel_links(hand, pose, object.shape(), *place, unit, skin, self._bearing, delta)
+        bearing = compute_touch(hand, pose, object.shape(), *place, unit, skin, self._bearing, delta)
         touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
         return touch, normal, jnp.sum(bearing.skin_force, -1)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import AssetError, ConfigError
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim.geometry import sdf
 from dexsim.geometry.distance import signed_distance
 
@@ -198,7 +198,7 @@ def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
             place = [f"{x:.6f}" for x in (*position, *normal)]
             out.writerow([name, *divmod(index, patch.grid[1]), *place, f"{area:.6g}"])
     path = Path(path)
-    write_whole(path, [text.getvalue().encode()])
+    write_atomic(path, [text.getvalue().encode()])
     return path
 
 

@@ -23,10 +23,10 @@ KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
-BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
-RANGES = (*SIZE_RANGES, *BULK_RANGES)
+PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
+RANGES = (*SIZE_RANGES, *PROPERTY_RANGES)
 """Fields of `ObjectConfig` that are drawn for every object."""
-MESH_RANGES = ("mesh_size", *BULK_RANGES)
+MESH_RANGES = ("mesh_size", *PROPERTY_RANGES)
 """Those of a mesh."""
 _SPANS = tuple(name for name in (*RANGES, "mesh_size") if name != "com_offset")  # pairs (low, high)
 SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
@@ -34,7 +34,7 @@ SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectConfig(Config):
-    """Which objects are drawn, and their ranges (low, high). Bulk (mass to restitution) is drawn at every episode
+    """Which objects are drawn, and their ranges (low, high). Mass to restitution are drawn at every episode
     start, shape and sizes once for each start state of the pool, whose poses were chosen for them."""
 
     shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)

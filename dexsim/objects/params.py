@@ -121,41 +121,41 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
     object = ObjectParams(
         shape_index, size, position, active, zero, three, three, zero, jnp.zeros(2), quat, zero, kinds, extreme
     )
-    return _with_bulk(object, plain, _sample_bulk(keys, config, extreme))
+    return _with_properties(object, plain, _sample_properties(keys, config, extreme))
 
 
-# --- bulk: what an object is beside its shape, by the names of `BULK_RANGES` ---------------------
+# --- properties: what an object is beside its shape, by the names of `PROPERTY_RANGES` -----------
 
 
-def redraw_bulk(
+def resample_properties(
     key: jax.Array, object: ObjectParams, config: ObjectConfig, plain: jax.Array, names: tuple[str, ...]
 ) -> ObjectParams:
-    """The same object with another bulk; an extreme object stays one. Its shape stays: start states were chosen for it.
+    """The same object with other properties; an extreme one stays one. Its shape stays: the start was chosen for it.
 
     Args:
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
-      names: the ranges, of `BULK_RANGES`, that are drawn.
+      names: the ranges, of `PROPERTY_RANGES`, that are drawn.
     """
-    drawn = _sample_bulk(jax.random.split(key, 8), config.narrowed(), object.extreme)
-    bulk = _bulk_of(object, plain)
-    return _with_bulk(object, plain, bulk | {name: drawn[name] for name in names})
+    drawn = _sample_properties(jax.random.split(key, 8), config.narrowed(), object.extreme)
+    properties = _properties_of(object, plain)
+    return _with_properties(object, plain, properties | {name: drawn[name] for name in names})
 
 
-def _sample_bulk(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:
-    """One value of each bulk range; "com_offset" is the centre of mass [3], "restitution" a damping ratio."""
+def _sample_properties(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:
+    """One value of each of `PROPERTY_RANGES`; "com_offset" is the centre of mass [3], "restitution" a damping ratio."""
     names = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
     spans = [(-1.0, 1.0) if name == "com_offset" else getattr(config, name) for name in names]
     keys = jnp.concatenate([keys[2:], jax.random.fold_in(keys[5], 1)[None]])
     rows = dict(zip(names, uniforms(keys, spans, extreme, (3,)), strict=True))
-    bulk = {name: row if name == "com_offset" else row[0] for name, row in rows.items()}
-    return bulk | {
-        "com_offset": config.com_offset * bulk["com_offset"],
-        "restitution": damping_ratio(bulk["restitution"]),
+    properties = {name: row if name == "com_offset" else row[0] for name, row in rows.items()}
+    return properties | {
+        "com_offset": config.com_offset * properties["com_offset"],
+        "restitution": damping_ratio(properties["restitution"]),
     }
 
 
-def _bulk_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Array]:
-    """The bulk of an object whose shape has the unit inertia `plain` [3]."""
+def _properties_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Array]:
+    """The properties of an object whose shape has the unit inertia `plain` [3]."""
     link_friction = object.friction if object.link_friction is None else object.link_friction
     return {
         "mass": object.mass,
@@ -168,16 +168,16 @@ def _bulk_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Array]:
     }
 
 
-def _with_bulk(object: ObjectParams, plain: jax.Array, bulk: dict[str, jax.Array]) -> ObjectParams:
-    """The object with this bulk; see `_bulk_of`."""
+def _with_properties(object: ObjectParams, plain: jax.Array, properties: dict[str, jax.Array]) -> ObjectParams:
+    """The object with these properties; see `_properties_of`."""
     return dataclasses.replace(
         object,
-        mass=bulk["mass"],
-        inertia=bulk["mass"] * plain * bulk["inertia_scale"],
-        com=bulk["com_offset"],
-        friction=bulk["friction"],
-        contact=jnp.stack([bulk["stiffness"], bulk["restitution"]]),
-        link_friction=None if object.link_friction is None else bulk["link_friction"],
+        mass=properties["mass"],
+        inertia=properties["mass"] * plain * properties["inertia_scale"],
+        com=properties["com_offset"],
+        friction=properties["friction"],
+        contact=jnp.stack([properties["stiffness"], properties["restitution"]]),
+        link_friction=None if object.link_friction is None else properties["link_friction"],
     )
 
 
@@ -191,17 +191,17 @@ def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> ja
 
 
 def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
-    """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
+    """A drawn object with its properties nearer to nominal: mass, inertia, centre of mass, friction, contact.
 
     Args:
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
-    config, bulk = config.narrowed(), _bulk_of(object, plain)
-    middle: dict[str, Any] = {name: 0.0 if name == "com_offset" else nominal(config, name) for name in bulk}
+    config, properties = config.narrowed(), _properties_of(object, plain)
+    middle: dict[str, Any] = {name: 0.0 if name == "com_offset" else nominal(config, name) for name in properties}
     middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
-    near = {name: middle[name] + scale * (value - middle[name]) for name, value in bulk.items()}
-    return _with_bulk(object, plain, near)
+    near = {name: middle[name] + scale * (value - middle[name]) for name, value in properties.items()}
+    return _with_properties(object, plain, near)
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:

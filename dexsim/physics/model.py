@@ -48,8 +48,8 @@ def build_scene(
 
     plain = mujoco.MjSpec()  # Its defaults are MuJoCo's: those of the hand's file are for the hand.
     # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
-    bulk = {"mass": 0.1, "inertia": [5e-5] * 3, "explicitinertial": True}
-    body = spec.worldbody.add_body(name="object", pos=[0.1, 0, 0.1], **bulk)
+    inertial = {"mass": 0.1, "inertia": [5e-5] * 3, "explicitinertial": True}
+    body = spec.worldbody.add_body(name="object", pos=[0.1, 0, 0.1], **inertial)
     body.add_freejoint(name="object")
     for k, kind in enumerate(slots):
         body.add_geom(

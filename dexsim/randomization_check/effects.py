@@ -11,7 +11,7 @@ import numpy as np
 from dexsim.core.pytree import align
 from dexsim.env.env import Env
 from dexsim.env.episode import EpisodeSampler
-from dexsim.env.senses import SensorSuite
+from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Episode, State
 from dexsim.objects.config import SHAPES, nominal
 from dexsim.randomization import NOMINAL

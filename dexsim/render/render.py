@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
@@ -209,7 +209,7 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
             raise OSError(f"{path}: the film cannot be encoded in {folder} (is the disk full?)") from None
         finally:
             writer.close()
-        write_whole(path, [film.read_bytes()])
+        write_atomic(path, [film.read_bytes()])
     return path
 
 
@@ -222,5 +222,5 @@ def _write_gif(frames: list[np.ndarray], path: Path, fps: float) -> Path:
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     buffer = io.BytesIO()
     images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
-    write_whole(path, [buffer.getvalue()])
+    write_atomic(path, [buffer.getvalue()])
     return path

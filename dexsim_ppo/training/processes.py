@@ -49,7 +49,7 @@ def agree(number: int) -> int:
     return int(np.max(multihost_utils.process_allgather(np.int32(number))))
 
 
-def say(text: str) -> None:
+def print_on_first(text: str) -> None:
     """Print a line, in the first process."""
     if is_first():
         print(text, flush=True)

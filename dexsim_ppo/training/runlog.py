@@ -15,7 +15,7 @@ import numpy as np
 
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError, ConfigError
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.arguments import TrainArguments, printable
 
@@ -141,7 +141,7 @@ class MetricsLog:
         self._closing = folder.lock()
         rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
         # A resumed run repeats what came after its checkpoint.
-        write_whole(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
+        write_atomic(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
         folder.set_aside(first_iteration)
         self._file = self._closing.enter_context(folder.metrics.open("a", buffering=1))
         self._tensorboard = _tensorboard_writer(folder.path)

@@ -73,13 +73,13 @@ class Run:
           stopped: nonzero once the run is to end early, in all processes alike.
         """
         devices, device = self.mesh.size if self.mesh else 1, jax.devices()[0].device_kind
-        processes.say(
+        processes.print_on_first(
             f"{self.folder.path}: {self.arguments.task}, {self.config.num_envs} environments, {self.env.backend} "
             f"physics on {f'{devices} x ' if devices > 1 else ''}{device}"
         )
-        processes.say("compiling the training step: a minute on two cores, seconds once it is in the cache")
+        processes.print_on_first("compiling the training step: a minute on two cores, seconds once it is in the cache")
         state, step = self._prepare(source)
-        processes.say(f"compiled in {self.clock['compile_s']:.1f} s")
+        processes.print_on_first(f"compiled in {self.clock['compile_s']:.1f} s")
         log = MetricsLog(self.folder, int(state.iteration), self.arguments) if processes.is_first() else None
         try:
             self._loop(state, step, log, stopped)
@@ -134,7 +134,7 @@ class Run:
             iteration += per_call
             if len(calls_s) == 1:
                 self.clock["first_update_s"] = time.perf_counter() - self.started
-                processes.say(f"first update {self.clock['first_update_s']:.1f} s after the start")
+                processes.print_on_first(f"first update {self.clock['first_update_s']:.1f} s after the start")
             faults.check(metrics, iteration)
             rate = per_call * per_iteration / calls_s[-1]
             row = means(metrics) | {
@@ -150,7 +150,7 @@ class Run:
             if evaluated or iteration == first + per_call or due(iteration, per_call, arguments.log_every):
                 if log:
                     log.write(row)
-                processes.say(progress_line(row))
+                processes.print_on_first(progress_line(row))
             if due(iteration, per_call, arguments.checkpoint_every):
                 self._save(state, iteration)
         self.clock["training_s"] = time.perf_counter() - begin
@@ -218,7 +218,7 @@ class Run:
         if better:
             self.best = {"return": score, "iteration": iteration}
             self._write_policy(policy, self.folder.best)
-        processes.say(
+        processes.print_on_first(
             f"evaluation at iteration {iteration}: {first} {figures[first]:.3g}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
             f"({report['seconds']:.1f} s)"
@@ -323,4 +323,4 @@ class Faults:
             )
         if not known:
             text = f"{lost} of {self._per_call} updates skipped, their gradient is not finite"
-            processes.say(f"iteration {iteration}: {text}; {before}")
+            processes.print_on_first(f"iteration {iteration}: {text}; {before}")

@@ -89,7 +89,7 @@ class CalibrateArguments(Config):
             raise HandError(f"{self.destination} already exists: give another --output, or --force to overwrite it")
         outputs = {"--output": self.destination, "--plot": self.plot, "--log": self.log}
         inputs = {f"--from-log {path}": path for path in self.from_log}
-        cli.check_apart(outputs, inputs | {"calibration": self.calibration})
+        cli.check_no_overwrite(outputs, inputs | {"calibration": self.calibration})
         # With another finger or joint than meant the wrong one would move.
         own = {"fingers": False, "gauge": False, "plot": False, "joints": True, "dead_band": True}
         for name, identify in own.items():

@@ -66,7 +66,7 @@ class Alarms:
         self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, its angle then
         self._serious = 0  # serious refusals in a row
 
-    def see(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
+    def update(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
         """Judge an answer at a time in s to a command [J] rad; None with the motors off."""
         self.refused, self._serious = "", 0
         sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))

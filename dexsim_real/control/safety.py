@@ -80,7 +80,7 @@ class TargetRequest(NamedTuple):
 class Safety:
     """Decides which command is sent.
 
-    Not thread-safe: one thread calls `decide`, `see` and `engage`. Another may call `set_target`, which replaces one
+    Not thread-safe: one thread calls `decide`, `update` and `engage`. Another may call `set_target`, which replaces one
     tuple. `note` is called with one line whenever the reaction or its reason changes.
     """
 
@@ -124,7 +124,7 @@ class Safety:
         """What the hand said when it refused a command, until it answers one again."""
         return self._alarms.refused
 
-    def see(self, sample: HandSample) -> bool:
+    def update(self, sample: HandSample) -> bool:
         """Update with a measurement; returns whether it is plausible. Otherwise it does not count as one."""
         if self._generation not in (None, sample.generation):
             # The hand was disconnected with its motors off: its pose may have changed. A wrong reading remains wrong.
@@ -141,7 +141,7 @@ class Safety:
             self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
             return False
         self.sample, self._wrong = sample, None
-        self._alarms.see(sample.time, measured, self._commanded)
+        self._alarms.update(sample.time, measured, self._commanded)
         return True
 
     def refuse(self, refusal: Refusal | None) -> None:

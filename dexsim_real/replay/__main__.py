@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Recompute and plot the log of a run on the hand.",
     )
     outputs = {"--plot": arguments.plot, "--rrd": arguments.rrd, "--output": arguments.output}
-    cli.check_apart(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
+    cli.check_no_overwrite(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
     for path in filter(None, outputs.values()):
         cli.check_writable(path)
     if arguments.lerobot:

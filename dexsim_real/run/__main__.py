@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Run a policy on the hand.",
     )
     inputs = {"policy": arguments.policy, "calibration": arguments.calibration, "TOML of the hand": arguments.hand}
-    cli.check_apart({"--log": arguments.log, "--output": arguments.output}, inputs)
+    cli.check_no_overwrite({"--log": arguments.log, "--output": arguments.output}, inputs)
     if arguments.output:
         cli.check_writable(arguments.output)
     with stopping(leaving=argv is None):

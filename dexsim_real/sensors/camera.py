@@ -107,16 +107,16 @@ class HeightSensor:
         self._thread.start()
 
     @property
-    def seen(self) -> bool:
+    def has_measurement(self) -> bool:
         """Whether the object has been seen."""
         return self._newest is not None
 
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Time of the newest measurement (s, monotonic clock), position [3] m and filtered velocity [3] m/s."""
-        assert self._newest is not None, "wait until `seen` is true"
+        assert self._newest is not None, "wait until `has_measurement` is true"
         return self._newest
 
-    def see(self, when: float, mask: np.ndarray) -> None:
+    def update(self, when: float, mask: np.ndarray) -> None:
         """Update with the mask of a picture taken at a time in s; one no newer than the newest says nothing new."""
         if self._newest is not None and when <= self._newest[0]:
             return
@@ -145,7 +145,7 @@ class HeightSensor:
                     return
                 when, mask = picture
                 now = time.monotonic()
-                self.see(when if when < now else now, mask)
+                self.update(when if when < now else now, mask)
             except Exception as error:  # Also of the user's function.
                 self.failure = f"the camera failed: {' '.join(str(error).split()) or type(error).__name__:.200}"
                 return

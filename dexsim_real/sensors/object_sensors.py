@@ -23,7 +23,7 @@ class ObjectSensors:
 
         Raises HandError: no picture will come any more.
         """
-        if self._camera and not self._camera.seen:
+        if self._camera and not self._camera.has_measurement:
             if self._camera.failure:
                 raise HandError(self._camera.failure)
             return False

@@ -141,7 +141,7 @@ def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
     """The bridge's height sensor, without a socket; its pictures come when they are scheduled."""
     optics, reference = CameraConfig(), np.asarray(spec.reference, float)
     sensor = HeightSensor(lambda: None, optics, reference, spec.object_axes, spec.velocity_filter)
-    port.every(1 / CAMERA_RATE, 0.002, lambda: sensor.see(port.time, picture(port.plant, optics)))
+    port.every(1 / CAMERA_RATE, 0.002, lambda: sensor.update(port.time, picture(port.plant, optics)))
     return sensor
 
 

@@ -10,8 +10,8 @@ from dexsim.env.task import GroundTruth
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
-from dexsim.touch.feel import Touch, feel_links
 from dexsim.touch.surface import skin_surface
+from dexsim.touch.taxel_force import Touch, compute_touch
 
 
 def with_episode(state, **parts):
@@ -69,5 +69,5 @@ def tip_stiffness(physics, skin, object, qpos):
     with jax.ensure_compile_time_eval():  # points of the skin, also where the caller is traced
         surface = skin_surface(hand, skin)
     unit = jnp.ones(hand.num_fingers)
-    pressed = feel_links(hand, pose, object.shape(), place[:3], turn, unit, skin, surface).skin_force.sum(-1)
+    pressed = compute_touch(hand, pose, object.shape(), place[:3], turn, unit, skin, surface).skin_force.sum(-1)
     return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

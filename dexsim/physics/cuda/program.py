@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError
-from dexsim.core.files import make_private, read_private, write_whole
+from dexsim.core.files import make_private, read_private, write_atomic
 from dexsim.core.install import install_line
 from dexsim.physics.cuda.law import PrintedLaw
 from dexsim.physics.cuda.scene import buffers, declare_args, kernel_constants
@@ -77,7 +77,7 @@ def compile_kernel(text: str, architecture: str) -> bytes:
     code = compiler.compile(text, headers(), options)
     with contextlib.suppress(OSError):  # a disk without room or rights
         make_private(path.parent)
-        write_whole(path, [code])
+        write_atomic(path, [code])
     return code
 
 

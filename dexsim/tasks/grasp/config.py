@@ -1,4 +1,4 @@
-"""Settings of the grasp task."""
+"""Settings of the grasp task; what its policy observes is `dexsim.observation.GRASP`."""
 
 import dataclasses
 

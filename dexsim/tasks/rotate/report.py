@@ -7,12 +7,12 @@ from dexsim.core import statistics
 _PERCENTILES = (1, 5, 10, 25, 50, 75, 90, 95, 99)
 
 
-def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float, ticks: int) -> dict:
+def summarize(metrics: dict[str, np.ndarray], episode_length: np.ndarray, control_period: float, ticks: int) -> dict:
     """Reduce an evaluation to a report.
 
     Args:
       metrics: [N] of each episode's last tick, as the environment returns them.
-      lived: [N] ticks before the object was lost.
+      episode_length: [N] ticks before the object was lost.
       control_period: s.
       ticks: length of an episode that nothing ended.
 
@@ -25,14 +25,14 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
       out. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %: Wilson's
       for proportions, else bootstrap over episodes.
     """
-    seconds, successes = lived * control_period, metrics["successes"]
+    seconds, successes = episode_length * control_period, metrics["successes"]
     some = successes > 0
     pace = metrics["time_at_last_success"][some] / successes[some]
-    kept = lived >= ticks
+    kept = episode_length >= ticks
     duty = np.stack([metrics[name] for name in sorted(metrics) if name.startswith("duty/")], -1)
     minutes = np.maximum(seconds, control_period) / 60  # A drop in the first tick leaves none.
     report = {
-        "episodes": int(lived.size),
+        "episodes": int(episode_length.size),
         "seconds": ticks * control_period,
         "successes": _counts(successes),
         "paper_successes": _counts(metrics["paper_successes"]),

@@ -22,7 +22,7 @@ import numpy as np
 from dexsim.core.assets import cache_path
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
-from dexsim.core.files import write_whole
+from dexsim.core.files import write_atomic
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
@@ -71,7 +71,7 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
         buffer = io.BytesIO()
         np.savez(buffer, **{f"a{i}": rows for i, rows in enumerate(stored)})
         with contextlib.suppress(OSError):  # a disk without room or rights
-            write_whole(path, [buffer.getbuffer()])
+            write_atomic(path, [buffer.getbuffer()])
     qpos, qvel, joint_target, *rows = stored
     return Start(qpos=qpos, qvel=qvel, object=jax.tree.unflatten(structure, rows), joint_target=joint_target)
 

@@ -22,7 +22,7 @@ from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand
 from dexsim.objects import params
-from dexsim.objects.config import BULK_RANGES, KINDS, MESH_RANGES
+from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
@@ -121,7 +121,7 @@ class Rotate(Task):
         config = dataclasses.replace(config, posture=posture, reference=reference)
         self.config, self.hand, self.posture, self.turn = config, hand, posture, config.turn
         self.slots, self.largest = slots(config), largest_size(config)
-        drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
+        drawn = ("edge", *(f"objects.{name}" for name in PROPERTY_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
@@ -281,6 +281,6 @@ class Rotate(Task):
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 
-    def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float) -> dict:
+    def summarize(self, metrics: dict[str, np.ndarray], episode_length: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.rotate.report`."""
-        return summarize(metrics, lived, control_period, self.evaluation_ticks)
+        return summarize(metrics, episode_length, control_period, self.evaluation_ticks)

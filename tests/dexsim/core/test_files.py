@@ -8,7 +8,7 @@ import pytest
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError, DexsimWarning
-from dexsim.core.files import make_private, write_whole
+from dexsim.core.files import make_private, write_atomic
 
 
 def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
@@ -36,12 +36,12 @@ def test_what_a_command_writes_replaces_nothing_that_it_reads_or_wrote(tmp_path,
     link.symlink_to(read)
     for path in (Path("read.toml"), link):
         with pytest.raises(ConfigError, match=f"^--output {path}: is the calibration; name another file"):
-            cli.check_apart({"--output": path}, {"policy": "grasp", "calibration": read})
+            cli.check_no_overwrite({"--output": path}, {"policy": "grasp", "calibration": read})
     with pytest.raises(ConfigError, match="^--output new.json: is the file of --log, too"):
-        cli.check_apart({"--log": new, "--output": Path("new.json")}, {})
+        cli.check_no_overwrite({"--log": new, "--output": Path("new.json")}, {})
     nowhere = Path(os.devnull)
-    cli.check_apart({"--log": nowhere, "--output": nowhere, "--plot": None}, {"calibration": None})
-    cli.check_apart({"--output": Path("grasp")}, {"policy": "grasp"})  # a name, and no file
+    cli.check_no_overwrite({"--log": nowhere, "--output": nowhere, "--plot": None}, {"calibration": None})
+    cli.check_no_overwrite({"--output": Path("grasp")}, {"policy": "grasp"})  # a name, and no file
 
 
 def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
@@ -51,7 +51,7 @@ def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
 
     (tmp_path / "file").write_text("before")
     with pytest.raises(KeyboardInterrupt):
-        write_whole(tmp_path / "file", chunks())
+        write_atomic(tmp_path / "file", chunks())
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
 
 
@@ -61,7 +61,7 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mod
     (tmp_path / "old").chmod(mode)
     (tmp_path / "other").write_text("1")
     for name in ("old", "new"):
-        write_whole(tmp_path / name, [b"2"])
+        write_atomic(tmp_path / name, [b"2"])
     modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
     assert modes == {"old": mode, "new": modes["other"], "other": modes["other"]}
 
@@ -70,7 +70,7 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mod
         assert temporary.stat().st_mode & 0o077 == 0, "nobody else reads what is being written"
         yield b"3"
 
-    write_whole(tmp_path / "old", chunks())
+    write_atomic(tmp_path / "old", chunks())
 
 
 def test_a_private_folder(tmp_path):

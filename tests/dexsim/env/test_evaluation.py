@@ -1,4 +1,4 @@
-"""What episodes draw: the object's bulk anew each time, and evaluations from start states that training never had."""
+"""What episodes draw: properties of objects anew each time, evaluations from start states that training never had."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def drawn(env):
     return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
 
 
-def bulk(object):
+def properties(object):
     """Values [..., 9] that are uniform in the ranges of `spans`."""
     return np.stack(
         [object.mass, object.friction, object.link_friction, *np.moveaxis(object.com, -1, 0), object.contact[..., 0]],
@@ -48,7 +48,7 @@ def spans(config):
     return np.array([config.mass, config.friction, config.link_friction, offset, offset, offset, config.stiffness])
 
 
-class TestBulk:
+class TestProperties:
     def test_inertia_follows_mass_and_shape(self, env, drawn):
         """A box's is m/3 (b^2 + c^2); every ratio to it lies in the range, the same for all three axes."""
         boxes = np.flatnonzero(np.asarray(drawn.shape_index)[:, 0] == 1)
@@ -63,7 +63,7 @@ class TestBulk:
         extreme = np.asarray(env.pool.object.extreme)
         assert 0 < extreme.sum() < 8
         low, high = spans(env.config.objects).T
-        place = (bulk(drawn) - low) / (high - low)
+        place = (properties(drawn) - low) / (high - low)
         at_end = np.isclose(place, 0, atol=1e-4) | np.isclose(place, 1, atol=1e-4)
         assert np.all(at_end[extreme]) and np.mean(at_end[~extreme]) < 0.01
         heavy = np.mean(place[extreme][..., 0] > 0.5)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dexsim.env.episode import EpisodeSampler
-from dexsim.env.senses import SensorSuite
+from dexsim.env.sensors import SensorSuite
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams, measure_orientation
@@ -53,13 +53,13 @@ def test_the_first_reading_has_the_sensors_error_also_where_it_is_slower_than_th
 def test_the_heading_drifts_from_the_start_of_the_episode(hand):
     """Also where the clock of the time limit began at random: two ticks after a start it has drifted for two ticks."""
     config = RotateConfig(sensing=Sensing(orientation=CONFIG))
-    senses, true = SensorSuite(config, hand, Rotate(config, hand)), quat(TURNED)
+    sensors, true = SensorSuite(config, hand, Rotate(config, hand)), quat(TURNED)
     now = SimpleNamespace(object_quat=true)
     last = SimpleNamespace(length=jnp.int32(1), tick=jnp.int32(500), readings=SimpleNamespace(object_quat=true))
-    read = senses._read_orientation(jax.random.key(0), now, now, SimpleNamespace(imu=params(drift=0.1)), last)
+    read = sensors._read_orientation(jax.random.key(0), now, now, SimpleNamespace(imu=params(drift=0.1)), last)
     turn = (rotation(read) * TURNED.inv()).as_rotvec()
     gravity = np.asarray(Rotate(config, hand).gravity)
-    np.testing.assert_allclose(turn, -gravity / np.linalg.norm(gravity) * 0.1 * 2 * senses.period, atol=1e-5)
+    np.testing.assert_allclose(turn, -gravity / np.linalg.norm(gravity) * 0.1 * 2 * sensors.period, atol=1e-5)
 
 
 @pytest.mark.parametrize(("ranges", "curriculum"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.5), (1.0, 0.0)])

@@ -26,7 +26,7 @@ from dexsim.tasks.grasp.task import (
     posture_distance,
 )
 from dexsim.tasks.terms import action_rate, joint_speed
-from dexsim.touch.feel import Touch
+from dexsim.touch.taxel_force import Touch
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
 CENTRE = (0.055, -0.005, 0.090)  # m, of the shipped hand

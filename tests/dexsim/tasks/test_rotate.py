@@ -25,7 +25,7 @@ from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, upri
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import _fingerprint
 from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
-from dexsim.touch.feel import Touch
+from dexsim.touch.taxel_force import Touch
 
 PERIOD = RotateConfig().physics.control_period
 CORNERS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a cube from -1 to 1

@@ -6,9 +6,9 @@ import pytest
 from shapes import solid
 
 from dexsim.hand.kinematics import forward_kinematics
-from dexsim.touch.feel import feel_links
 from dexsim.touch.skin import Skin, skin_stress
 from dexsim.touch.surface import whole_surface
+from dexsim.touch.taxel_force import compute_touch
 
 REACH = 0.003
 SKIN = Skin()
@@ -74,7 +74,7 @@ def press(hand, surface, finger, point, normal, total=5.0, depth=0.001):
     # The rubber reaches `margin` out of the lattice.
     local = np.asarray(point) + np.asarray(normal) * (0.010 + SKIN.margin - depth)
     place = pose.body_position[hand.tip_body[finger]] + pose.tip_rotation[finger] @ local
-    touch = feel_links(
+    touch = compute_touch(
         hand, pose, solid("sphere", 0.010), place, jnp.eye(3), jnp.full(hand.num_fingers, total), SKIN, surface
     )
     return float(touch.force[finger, : hand.num_taxels].sum()), float(touch.force[finger].sum())

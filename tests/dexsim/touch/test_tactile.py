@@ -10,8 +10,8 @@ from shapes import solid
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.touch import reduce as touch_reduce
 from dexsim.touch import skin as touch_skin
-from dexsim.touch.feel import keep_normal_part
 from dexsim.touch.skin import Skin
+from dexsim.touch.taxel_force import project_on_normals
 
 EYE = np.eye(3, dtype=np.float32)
 reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
@@ -216,7 +216,7 @@ def test_taxels_of_one_axis_feel_only_what_presses(direction, pressed):
         Skin(margin=0.0),
     )
     normals = np.broadcast_to(np.float32([0, 0, 1]), taxels.shape)
-    only = keep_normal_part(touch, normals, 5 * np.float32([direction]))
+    only = project_on_normals(touch, normals, 5 * np.float32([direction]))
     assert float(only.force.sum()) == pytest.approx(pressed, abs=1e-5)
     np.testing.assert_allclose(only.force, touch.force * pressed / 5, atol=1e-6)
     np.testing.assert_array_equal(only.skin_force, touch.skin_force)

@@ -12,9 +12,9 @@ from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, rotations, sdf, surface_points
 from dexsim.geometry.mesh import load_mesh
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
-from dexsim.touch.feel import feel_links
 from dexsim.touch.reduce import reduce_touch, reduce_touch_links
 from dexsim.touch.skin import MATERIALS, Skin, skin_of, skin_stress
+from dexsim.touch.taxel_force import compute_touch
 
 JOINTS = np.float32([1.45, 0.08, 0.12, 0.0, 0.55, 0.4, 0.55, 0.4, 0.55, 0.4, 0.55, 0.4])
 BALL, BRICK = solid("sphere", 0.03), solid("box", 0.02, 0.03, 0.025)
@@ -29,7 +29,7 @@ def links(hand):
     pose = jax.jit(lambda q: forward_kinematics(hand, q))(JOINTS)
 
     def feel(geometry, skin):
-        touch = feel_links(hand, pose, geometry, PLACE, TURN, TOTAL, skin)
+        touch = compute_touch(hand, pose, geometry, PLACE, TURN, TOTAL, skin)
         return touch, *reduce_touch_links(touch.force, hand, pose)
 
     return jax.jit(feel, static_argnames="skin"), pose, taxel_positions(hand, pose), taxel_normals(hand, pose)
@@ -72,7 +72,7 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
 
     @jax.jit
     def total(place):
-        return feel_links(hand, pose, ball, place, jnp.eye(3), jnp.zeros(5), skin).skin_force.sum()
+        return compute_touch(hand, pose, ball, place, jnp.eye(3), jnp.zeros(5), skin).skin_force.sum()
 
     exact, step = np.asarray(jax.jit(jax.grad(total))(PLACE)), 2e-5
     numeric = np.array(

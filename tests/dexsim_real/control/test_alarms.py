@@ -24,7 +24,7 @@ def cycle(bench, target=MIDDLE, *, read=None, follow=True, **fields):
     """One exchange with other fields of the measurement; `read` [J] rad in place of the true angles."""
     plain = sample(bench.now, bench.position if read is None else read)
     measured = dataclasses.replace(plain.measured, **{"mode": ON, **fields})
-    bench.safety.see(dataclasses.replace(plain, measured=measured))
+    bench.safety.update(dataclasses.replace(plain, measured=measured))
     return bench.cycle(target=target, fresh=False, follow=follow)
 
 
@@ -281,6 +281,6 @@ def test_only_serious_refusals_in_a_row_turn_the_motors_off(hand, between, fatal
     if between == "busy":
         alarms.refuse(read_refusal(b"\x06\x00"))
     if between == "answer":
-        alarms.see(1.0, sample(1.0).measured, None)
+        alarms.update(1.0, sample(1.0).measured, None)
     alarms.refuse(hot)
     assert bool(alarms.fatal) == fatal

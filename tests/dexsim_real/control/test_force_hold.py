@@ -24,7 +24,7 @@ def hold(hand, error, force, *, seconds=12.0, target=MIDDLE, before=2.0):
     path, was_on = [], []
     for k in range(-round(before / CYCLE), round(seconds / CYCLE)):
         reading = hands.angle[0] + (error(k) if k >= 0 else 0.0) * JOINT
-        safety.see(sample(hands.time, reading, force=force(k) if k >= 0 else 0.0))
+        safety.update(sample(hands.time, reading, force=force(k) if k >= 0 else 0.0))
         safety.set_target(target, hands.time)
         decision = safety.decide(hands.time)
         hands.cycle(decision.position[None], np.array([decision.mode != 0]), np.array([decision.stiffness]))
@@ -87,7 +87,7 @@ def test_no_hold_lasts_for_ever(hand, event):
     safety.engage()
     modes = []
     for _ in range(round(8.0 / CYCLE)):
-        safety.see(sample(now, MIDDLE, velocity=event.get("velocity", 0.0)))
+        safety.update(sample(now, MIDDLE, velocity=event.get("velocity", 0.0)))
         safety.set_target(event.get("target", MIDDLE), now)
         modes.append(safety.decide(now).mode != 0)
         now += CYCLE

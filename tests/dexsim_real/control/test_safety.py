@@ -50,7 +50,7 @@ class Bench:
         if fresh:
             # A last bit of noise: angles that never change are a fault of their own.
             noise = np.float32(1e-7) * (round(self.now / CYCLE) % 2)
-            self.safety.see(sample(self.now, self.position + noise, **measurement))
+            self.safety.update(sample(self.now, self.position + noise, **measurement))
         if target is not None:
             self.safety.set_target(target, self.now, hold)
         decision = self.safety.decide(self.now)

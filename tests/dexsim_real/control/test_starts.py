@@ -125,7 +125,7 @@ def starts(hand, kinds):
     def exchange(readings, generation, which):
         for h in which:
             safety = safeties[h]
-            safety.see(sample(hands.time, readings[h], generation=generation))
+            safety.update(sample(hands.time, readings[h], generation=generation))
             if moving[h]:
                 safety.set_target(MIDDLE + np.float32(0.6), hands.time)
             decision = safety.decide(hands.time)

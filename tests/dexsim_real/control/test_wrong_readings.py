@@ -243,7 +243,7 @@ def test_no_course_of_events_makes_a_command_jump(hand, steps):
             if reading != "true":
                 position = wrong(*reading, position)
             with np.errstate(all="ignore"):
-                bench.safety.see(sample(now, position, **measurement))
+                bench.safety.update(sample(now, position, **measurement))
         if target is not None:
             bench.safety.set_target(np.full(12, target) if isinstance(target, float) else np.array(target), now)
         decision = bench.safety.decide(now)

@@ -75,9 +75,9 @@ def test_velocity_is_filtered_as_in_the_simulation():
     config, reference = CameraConfig(), np.array([0.055, -0.005, 0.09])
     sensor = HeightSensor(lambda: None, config, reference, (True, False, False), 0.5)
     for k in range(8):
-        sensor.see(0.03 * k, picture(reference + [0.004 * k, 0, 0], config))
-        sensor.see(0.03 * k + 0.01, np.zeros((480, 640), bool))  # Out of sight for a moment.
-        sensor.see(0.03 * k - 0.02, picture(reference, config))  # Late, and says nothing new.
+        sensor.update(0.03 * k, picture(reference + [0.004 * k, 0, 0], config))
+        sensor.update(0.03 * k + 0.01, np.zeros((480, 640), bool))  # Out of sight for a moment.
+        sensor.update(0.03 * k - 0.02, picture(reference, config))  # Late, and says nothing new.
     when, position, velocity = sensor.read()
     assert when == pytest.approx(0.21)
     np.testing.assert_allclose(position, reference + [0.028, 0, 0], atol=6e-4)
@@ -102,7 +102,7 @@ def test_a_stream_of_masks_from_another_program(tmp_path):
     sensor = HeightSensor(open_masks(f"unix:{path}", config), config, reference, (True, False, False), 0.5)
     thread.join()
     until = time.monotonic() + 2
-    while (not sensor.seen or sensor.read()[0] < 5.0) and time.monotonic() < until:
+    while (not sensor.has_measurement or sensor.read()[0] < 5.0) and time.monotonic() < until:
         time.sleep(0.01)
     when, position, _ = sensor.read()
     assert when == 5.0 and position[0] == pytest.approx(0.055 + 0.04, abs=6e-4)
@@ -135,7 +135,7 @@ def test_a_picture_of_another_clock_does_not_stay_young(when):
     config, reference = CameraConfig(), np.array([0.055, -0.005, 0.09])
     pictures = iter([(when, picture(reference, config)), None])
     sensor = HeightSensor(lambda: next(pictures), config, reference, (True, False, False), 0.5)
-    assert until(lambda: sensor.seen) and sensor.read()[0] <= time.monotonic()
+    assert until(lambda: sensor.has_measurement) and sensor.read()[0] <= time.monotonic()
     sensor.close()
 
 

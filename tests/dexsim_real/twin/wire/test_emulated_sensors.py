@@ -65,7 +65,7 @@ def test_the_bridges_camera_sees_the_object(tmp_path):
         masks = open_masks(f"unix:{running.twin.masks.path}", OPTICS)
         sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
         until = time.monotonic() + 5
-        while not sensor.seen and time.monotonic() < until:
+        while not sensor.has_measurement and time.monotonic() < until:
             time.sleep(0.01)
         when, position, _ = sensor.read()
         assert position[0] == pytest.approx(0.047, abs=0.002) and 0 <= time.monotonic() - when < 0.3

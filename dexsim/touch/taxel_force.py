@@ -1,4 +1,4 @@
-"""What the taxels feel: depth below the object's surface, and the finger's force spread by it.
+"""Forces on the taxels: depth below the object's surface, and the finger's force spread by it.
 
 Method (paper, section Sim-to-Real Transfer): a taxel touches where it lies below the object's surface; its share of the
 finger's force follows the skin's stress at that depth; the finger's total is the contact force of the physics.
@@ -29,7 +29,7 @@ class Touch:
     force: jax.Array  # [F, N] N, the finger's total from the physics, shared by `skin_force`
 
 
-def feel_links(
+def compute_touch(
     hand: Hand,
     pose: HandPose,
     geometry: Any,
@@ -72,7 +72,7 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
     return finger_force[:, None] * skin_force / jnp.where(total > 0, total, 1.0)
 
 
-def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
+def project_on_normals(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
     """The same touch with only what presses into the skin of the fingers' forces [F, 3] N shared among the taxels.
 
     Outward taxel `normals` [F, N, 3] are in the same frame, whichever. A finger that touches nothing keeps 0.

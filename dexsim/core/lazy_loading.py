@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 
-def open_door(
+def lazy_exports(
     package: str, names: Sequence[str], homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """A package's `__getattr__` and `__dir__`, from its `__name__`, its `__all__` and the modules of its late names."""
@@ -22,14 +22,14 @@ def open_door(
     return getattribute, lambda: sorted(names)
 
 
-def begin_loading() -> None:
+def exit_on_interrupt() -> None:
     """From now on Ctrl-C ends the program with one line: modules that load abort, or show pages of their insides."""
     main_thread = threading.current_thread() is threading.main_thread()
     if main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
 
-def end_loading() -> None:
+def restore_interrupt() -> None:
     """From now on Ctrl-C raises KeyboardInterrupt again."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -41,4 +41,4 @@ def _leave(number: int, frame: Any) -> None:
 
 
 if sys.argv[:1] == ["-m"]:  # `python -m` with one of our modules, which is still to be found.
-    begin_loading()
+    exit_on_interrupt()

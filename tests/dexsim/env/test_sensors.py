@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dexsim.env.senses import SensorInput, SensorSuite
+from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams
 from dexsim.tasks.grasp.config import GraspConfig
