@@ -108,7 +108,7 @@ DAMAGED = [
     ("[-0.05,", f"[{10**400},", "damaged"),
     ("[-0.05,", '["a",', "damaged"),
     ("force_per_count = [", "force_per_count = [0.1, ", "'force_per_count' must hold 5 numbers"),
-    ("friction = ", "fiction = ", "KeyError: 'friction'"),
+    ("friction = ", "fiction = ", "unknown entry 'fiction'"),
     ("version = 2", "version = 1", "it has version 1, this library reads 2"),
     ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
     ("complete = true", "complete = false", "its end is missing"),
