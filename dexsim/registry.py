@@ -98,7 +98,7 @@ def find_task(name: str) -> TaskEntry:
     module, _, word = name.rpartition(":")
     if module:
         if word in _OURS:
-            raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
+            raise ConfigError(f"task {name!r}: {word!r} is a task of dexsim; choose another name")
         try:
             makes = getattr(importlib.import_module(module), word, None)
         except ImportError as error:
@@ -148,7 +148,7 @@ def make(
         enable_caches()
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
-            raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")
+            raise ConfigError(f"task {task!r} takes no config: it is not a task on a hand")
         try:
             inspect.signature(makes).bind()
         except TypeError:
@@ -178,4 +178,4 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
 
 
 def _no_task(config: Any, hand: Hand) -> Task:
-    raise ConfigError("not available for an environment from elsewhere: it can be trained and evaluated")
+    raise ConfigError("not supported without a hand: such an environment can only be trained and evaluated")

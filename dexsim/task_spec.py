@@ -78,7 +78,7 @@ class TaskSpec(Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.control.force.gain and self.finger_force is None:
-            raise ConfigError(f"task {self.name!r}: Control.force needs a force command, which the task has not")
+            raise ConfigError(f"task {self.name!r}: Control.force needs a force command: set Control.force.gain to 0")
 
     @property
     def force_loop(self) -> bool:

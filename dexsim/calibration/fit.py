@@ -86,7 +86,7 @@ def _side(hand: Hand, lines: Mapping[int, JointLines], where: str) -> Side:
     for joint, limit in enumerate(hand.torque_limit):
         mates = [joint] if joint in measured else [other for other in measured if hand.torque_limit[other] == limit]
         if not mates:
-            raise CalibrationError(f"{names[joint]}: no recording of any joint with {limit:g} Nm to take over")
+            raise CalibrationError(f"{names[joint]}: no press of a joint of {limit:g} Nm; record one")
         odd = [other for other in mates if measured[other]["gain"][0] * measured[mates[0]]["gain"][0] < 0]
         if odd:  # Their mean may be next to nothing.
             raise CalibrationError(

@@ -64,7 +64,7 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
         raise CalibrationError(f"{where}: at least {MIN_SAMPLES} samples of rising or of falling force are needed")
     if len(fits) == 2 and fits[0].gain * fits[1].gain < 0:
         raise CalibrationError(
-            f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
+            f"{where}: rises with force while loading, falls while unloading; check joint and finger names"
         )
     notes = _line_notes(lines, unit)
     if clipped := int(np.sum(~free)):

@@ -99,7 +99,7 @@ def fit_finger(press: TaxelPress) -> FingerFit:
     line = fit_line(force[above], total[above], group=group[above])
     gain, offset = Estimate(line.gain, *line.gain_interval), Estimate(line.offset, *line.offset_interval)
     if gain.low <= 0:
-        raise CalibrationError(f"readings do not rise with force (gain {gain}); is the recording aligned?")
+        raise CalibrationError(f"readings do not rise with force (gain {gain}); align both in time")
     residual = float(np.sqrt(np.mean((total[above] - line(force[above])) ** 2)))
     return FingerFit(gain, offset, threshold, residual, int(above.sum()), tuple(notes))
 

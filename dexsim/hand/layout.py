@@ -235,7 +235,7 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
     if np.any(count != columns * rows):
         worst = int(np.argmin(count))
         raise AssetError(
-            f"{path}: finger {fingers[worst]!r} has {count[worst]} sound taxels, the grid asks for {columns * rows}"
+            f"{path}: finger {fingers[worst]!r} has {count[worst]} valid taxels, expected {columns * rows}"
         )
     return table.reshape(len(fingers), -1, 7)
 

@@ -30,7 +30,7 @@ def check_same(record: Record | None, hand: Hand, what: str) -> None:
     now = record_of(hand)
     if (record and record["digest"]) != (now and now["digest"]):
         changed = ": its files have changed since" if record and now and record["file"] == now["file"] else ""
-        raise ConfigError(f"{what} is of the hand {_name(record)}, not of {_name(now)}{changed}")
+        raise ConfigError(f"{what}: expected the hand {_name(record)}, got {_name(now)}{changed}")
 
 
 def recorded_hand(record: Record | None, given: str | Path | None, what: str) -> Hand | None:
@@ -39,7 +39,7 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
     Files that were changed since are refused. A given file of the same joints, fingers and taxels is warned of.
 
     Raises:
-      ConfigError: the hand is another one, or its record makes no sense.
+      ConfigError: the hand is another one, or its record is invalid.
       AssetError: its files are missing or broken.
     """
     if record is not None:
@@ -49,7 +49,7 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
             return None
         path = find_hand(record["file"])
         if path.suffix != ".toml" or not path.is_file():  # Nothing else is opened, whatever a policy's file names.
-            raise ConfigError(f"{what} is of the hand {_name(record)}, which is not here: give --hand FILE")
+            raise ConfigError(f"{what}: the TOML of its hand {_name(record)} is missing: give --hand FILE")
         hand = load_hand(record["file"])
         check_same(record, hand, what)
         return hand
@@ -66,10 +66,10 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
 
 
 def check_record(record: Any) -> None:
-    """Raises ConfigError: a record of a hand makes no sense."""
+    """Raises ConfigError: a record of a hand is invalid."""
     kinds = {"file": str, "digest": str, "joints": list, "fingers": list, "taxels": int}
     if not isinstance(record, dict) or any(type(record.get(name)) is not kind for name, kind in kinds.items()):
-        raise ConfigError(f"the record of the hand makes no sense: {str(record):.80}")
+        raise ConfigError(f"invalid record of the hand: {str(record):.80}")
 
 
 def record_as_of(hand: Hand) -> Record:

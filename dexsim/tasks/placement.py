@@ -51,5 +51,5 @@ def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Arr
         points = rotations.rotate_inverse(rotation, points - align(position, points))
         gaps.append(jnp.min(sdf.signed_distance(points, shape) - radius))
     if not gaps:
-        raise AssetError(f"{hand.model_path}: no capsule, sphere or box of a link touches: what to keep clear of?")
+        raise AssetError(f"{hand.model_path}: no capsule, sphere or box has contype or conaffinity above 0")
     return jnp.min(jnp.stack(gaps))

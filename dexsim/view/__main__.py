@@ -74,7 +74,7 @@ def open_source(arguments: ViewArguments) -> "Source":
         except ConfigError as error:
             raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
         if environment:
-            raise ConfigError(f"{name}: is no task on a hand: there is nothing to show") from None
+            raise ConfigError(f"{name}: cannot be shown: not a task on a hand") from None
         env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
     else:
         env = policy.make_env(hand=hand)

@@ -90,7 +90,7 @@ class TrainArguments(Config, Generic[EnvConfig]):
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
     """The options that a checkpoint or `config.json` holds. Their task is a word: no file says what is imported."""
     if ":" in data["task"]:
-        raise ConfigError(f"TrainArguments.task = {data['task']!r}: must be a word; its module is given with --task")
+        raise ConfigError(f"TrainArguments.task = {data['task']!r}: must be a name; give its module with --task")
     return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 

@@ -61,7 +61,7 @@ class Operator:
         line = self._lines.get()
         if not line:
             self._lines.put("")  # For the next question.
-            raise HandError("nobody can answer: standard input is closed (--yes asks nothing)")
+            raise HandError("standard input is closed; run in a terminal, or give --yes")
         return line.strip()
 
     def _read(self) -> None:

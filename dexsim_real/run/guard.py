@@ -95,7 +95,7 @@ class Guard:
             self._asked = None
         late = self._asked is not None and time.monotonic() - self._asked > _ANSWER
         if late and not self._answered(_MOMENT):
-            raise HandError("the guard process stands still (suspended?)")
+            raise HandError("the guard process does not respond; start the run again")
 
     def dismiss(self, off: bool) -> None:
         """End of the run. Unless the motors are confirmed to be `off`, the process turns them off."""

@@ -409,7 +409,7 @@ class Session:
 def check_terminal() -> None:
     """Raises HandError: nobody can be asked, since input or error output is no terminal."""
     if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
-        raise HandError("no terminal, so nobody can be asked before the motors come on; give --yes or --motors-off")
+        raise HandError("cannot ask for confirmation without a terminal; give --yes or --motors-off")
 
 
 def ask() -> None:
@@ -418,7 +418,7 @@ def ask() -> None:
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # What was typed before the question is no answer to it.
     print(_QUESTION, end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise HandError("the answer was not yes: the motors stayed off")
+        raise HandError("not confirmed: the motors stayed off")
 
 
 def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSensors:

@@ -33,7 +33,7 @@ def zero_shot(monkeypatch):
     [
         ("--set nope=1", "the emulated hand has no parameter 'nope'"),
         ("--set mass=nan", "mass"),
-        ("--set thermal=inside", "thermal = 'inside': give a number"),
+        ("--set thermal=inside", "no parameter 'thermal' to sample"),
         ("--limit speed=1e9", "must be between 0.01 and 200 rad/s"),
         ("--policy rotate", "of the task 'rotate', not 'grasp'"),
         ("--policy nope", "nope: no such file"),

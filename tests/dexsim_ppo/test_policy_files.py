@@ -143,5 +143,5 @@ def test_no_file_chooses_which_module_is_imported(policy, tmp_path, monkeypatch)
     with pytest.raises(CheckpointError, match="invalid task"):
         load_policy(path)
     checkpoint.save(path, kind="train", task="grasp", content={"arguments": {"task": name}}, tree={})
-    with pytest.raises(DexsimError, match="must be a word"):
+    with pytest.raises(DexsimError, match="must be a name"):
         train.main(["--resume", str(path)])

@@ -71,7 +71,7 @@ def architecture() -> str:
     }
     if len(kinds) != 1:
         raise ConfigError(
-            f"backend 'cuda': GPUs of one kind, not of {', '.join(sorted(kinds))}: choose with CUDA_VISIBLE_DEVICES"
+            f"backend 'cuda': expected GPUs of one kind, got {', '.join(sorted(kinds))}: set CUDA_VISIBLE_DEVICES"
         )
     return kinds.pop()
 
@@ -153,7 +153,7 @@ def call(name: str, results: Sequence[jax.ShapeDtypeStruct], *arguments: jax.Arr
 def _serve(frame: Any) -> None:
     kernel = _kernels.get(ffi.attributes(frame)["kernel"].decode())
     if kernel is None:
-        raise RuntimeError("backend 'cuda': this process has not made the environment of this program")
+        raise RuntimeError("backend 'cuda': make the environment in the process that runs this program")
     arrays = [*ffi.addresses(frame.arguments), *ffi.addresses(frame.results)]
     first = ffi.Buffer.from_address(arrays[0])
     worlds = math.prod(first.dims[: first.rank - 1])

@@ -185,9 +185,12 @@ def sample_trial(
     table, given = bands(task), overrides or {}
     kinds = {name: number for name, number in given.items() if isinstance(number, str)}
     for name, number in given.items():
-        if name not in (table if name in kinds else table | STRUCTURE):
-            names = ", ".join(sorted([*table, *STRUCTURE]))
-            raise HandError(f"the emulated hand has no parameter {name!r} to sample or set; choose from {names}")
+        known = table if name in kinds else table | STRUCTURE
+        if name not in known:
+            what = "sample" if name in kinds else "set"
+            raise HandError(
+                f"the emulated hand has no parameter {name!r} to {what}; choose from {', '.join(sorted(known))}"
+            )
         if name in kinds and number not in KINDS:
             raise HandError(f"{name} = {number!r}: give a number, or one of {', '.join(KINDS)}")
     value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}

@@ -178,7 +178,7 @@ def test_joints_without_a_recording_take_their_class(hand):
             np.testing.assert_allclose(calibration.real.gain[:, joint], calibration.real.gain[:, mates].mean(1))
             assert np.all(calibration.real.samples[:, joint] == 0)
             assert any(note.startswith(f"{name}: not recorded") for note in calibration.notes)
-    with pytest.raises(CalibrationError, match="thumb_rota2: no recording of any joint with 0.4 Nm to take over"):
+    with pytest.raises(CalibrationError, match="thumb_rota2: no press of a joint of 0.4 Nm"):
         calibrated(hand, names=("thumb_bend",))
     with pytest.raises(CalibrationError, match="no joint 'elbow'"):
         calibrate(hand, {"elbow": recording()}, {})
@@ -215,7 +215,7 @@ BAD = {
     "force sits at its maximum .* saturated": lambda f, v: (np.minimum(f, 2.0), v),
     "give A, not counts": lambda f, v: (f, 1000 * v),
     "give N, not counts": lambda f, v: (1000 * f, v),
-    "mixed up": lambda f, v: (f, v * np.where(np.arange(600) % 200 < 100, 1, -1)),
+    "check joint and finger names": lambda f, v: (f, v * np.where(np.arange(600) % 200 < 100, 1, -1)),
 }
 
 

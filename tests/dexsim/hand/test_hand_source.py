@@ -60,7 +60,7 @@ def test_policy_carries_its_hand(own, tmp_path):
     assert policy.hand == record and policy.find_hand().digest == record["digest"]
     assert load_policy("grasp").hand is None and load_policy("grasp").find_hand() is None
     shutil.move("own", "elsewhere")
-    with pytest.raises(ConfigError, match=r"of the hand 'own/xhand_right.toml', which is not here: give --hand"):
+    with pytest.raises(ConfigError, match=r"the TOML of its hand 'own/xhand_right.toml' is missing: give --hand"):
         policy.find_hand()
     assert policy.find_hand("elsewhere/xhand_right.toml").digest == record["digest"]
 
@@ -72,14 +72,14 @@ def test_changed_files_are_refused_or_warned_of(own):
         policy.find_hand()
     with pytest.warns(OtherEnvWarning, match="is used on 'own/xhand_right.toml'"):
         policy.find_hand(own)
-    with pytest.raises(ConfigError, match="not of 'xhand_right'"):
+    with pytest.raises(ConfigError, match="got 'xhand_right'"):
         check_same(policy.hand, load_hand(), "the policy")
 
 
 def test_another_hand_is_refused(own):
     replace(own, 'name = "pinky"\n', 'name = "little"\n')
     replace("own/taxels.csv", "pinky,", "little,")
-    with pytest.raises(ConfigError, match="is of the hand 'xhand_right', not of 'own/xhand_right.toml'"):
+    with pytest.raises(ConfigError, match="expected the hand 'xhand_right', got 'own/xhand_right.toml'"):
         load_policy("grasp").find_hand(own)
 
 

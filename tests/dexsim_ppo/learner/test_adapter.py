@@ -1,4 +1,4 @@
-"""Environments from elsewhere: what the learner makes of five members, what is an error, and gymnax as in the docs."""
+"""Environments from elsewhere: what the learner makes of five members, and what is an error."""
 
 import dataclasses
 

@@ -82,7 +82,7 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
         assert command(*options, "--no-realtime") == 2
         assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
     lines = capsys.readouterr().err.strip().splitlines()
-    assert "firmware 1.3.9" in lines[0]
+    assert "serial number 2R32SCRIPTED" in lines[0]
     assert lines[-1].startswith("error: cannot tare the taxels: 3 adjacent taxels of the ring read above 40 counts")
     assert not output.exists()
 

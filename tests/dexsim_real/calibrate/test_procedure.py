@@ -332,7 +332,7 @@ def test_the_end_of_the_input_between_two_questions_is_the_end_of_the_second():
     assert who.ask("Enter presses", lambda: time.sleep(0.001)) == ""
     who._reader.join(5.0)
     for _ in range(2):
-        with pytest.raises(HandError, match="nobody can answer: standard input is closed"):
+        with pytest.raises(HandError, match="standard input is closed; run in a terminal"):
             who.ask("Enter presses", lambda: time.sleep(0.001))
 
 

@@ -154,7 +154,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):
         ({}, "either --calibration FILE, or --uncalibrated"),
         ({"--uncalibrated": (), "--calibration": ("x.toml",)}, "either --calibration FILE, or --uncalibrated"),
         ({"--uncalibrated": (), "--command": ("1.5",)}, "between 0 and 1"),
-        ({"--uncalibrated": ()}, "no terminal, so nobody can be asked"),
+        ({"--uncalibrated": ()}, "cannot ask for confirmation without a terminal"),
         ({"--uncalibrated": (), "--yes": (), "--fixed-object": ()}, "there is no such port"),
         ({"--uncalibrated": (), "--yes": (), "--port": None}, "--camera, or --fixed-object"),
     ],
@@ -201,7 +201,7 @@ def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
     (tmp_path / "secret").write_text("a = 1")
     record = {"digest": "", "joints": [], "fingers": [], "taxels": 1}
     for file in (tmp_path / "secret", tmp_path, tmp_path / "none.toml", "/dev/zero"):
-        with pytest.raises(ConfigError, match="which is not here: give --hand FILE"):
+        with pytest.raises(ConfigError, match="is missing: give --hand FILE"):
             recorded_hand(record | {"file": str(file)}, None, "policy.msgpack")
 
 

@@ -58,7 +58,7 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer):
             time.sleep(0.02)
         os.kill(watched._process.pid, signal.SIGSTOP)
         begin = time.monotonic()
-        with pytest.raises(HandError, match="the guard process stands still"):
+        with pytest.raises(HandError, match="the guard process does not respond"):
             while time.monotonic() < begin + 10:
                 watched.beat()
                 watched.check()

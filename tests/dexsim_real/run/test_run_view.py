@@ -168,7 +168,7 @@ def test_the_motors_stay_off_after_anything_else(tmp_path, asked, answer):
         code, terminal = asked(peer, tmp_path, answer)
         assert (code, terminal.motors) == (None, False)
         assert peer.commands and not peer.on().any()
-    assert "not yes" in records(tmp_path, Kind.END)[0]["end"]
+    assert "not confirmed" in records(tmp_path, Kind.END)[0]["end"]
 
 
 def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
