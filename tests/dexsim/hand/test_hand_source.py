@@ -93,5 +93,5 @@ def test_run_keeps_its_hand(own, tmp_path):
     heavier(own)
     with pytest.warns(OtherEnvWarning), pytest.raises(ConfigError, match="changed since"):
         find_hand(arguments, begun)
-    with pytest.raises(ConfigError, match="not of"):
+    with pytest.raises(ConfigError, match="expected the hand"):
         check_same(None, load_hand(own), "the log")

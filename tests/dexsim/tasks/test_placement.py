@@ -24,7 +24,7 @@ def test_spheres_count_and_a_hand_of_a_palm_alone_is_refused(hand):
     joints, away = jnp.zeros(hand.num_joints), jnp.array([1.0, 0.0, 0.1])
     middle = max(float(np.linalg.norm(np.asarray(geom.position))) for geom in hand.geoms)
     assert 0.5 - middle < float(clearance(balls, joints, shape, away, jnp.eye(3))) < 1.0
-    with pytest.raises(AssetError, match="no capsule, sphere or box of a link"):
+    with pytest.raises(AssetError, match="no capsule, sphere or box has contype"):
         clearance(with_geoms(hand, lambda g: g if g.kind == "box" else None), joints, shape, away, jnp.eye(3))
 
 

@@ -310,7 +310,7 @@ def test_another_hand_is_refused(hand, tmp_path):
 def test_nobody_at_the_terminal(hand, pressed, tmp_path, monkeypatch, stream):
     monkeypatch.setattr(sys, "stdin", None)  # As Python has it after `<&-`.
     who = Operator(Console(file=io.StringIO()), stream=stream)
-    with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
+    with pytest.raises(HandError, match="standard input is closed; run in a terminal, or give --yes"):
         record(pressed, hand, arguments(tmp_path, yes=False, press=QUICK), who)
     assert off(pressed) and pressed.closed
 

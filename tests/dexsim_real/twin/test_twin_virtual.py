@@ -72,8 +72,8 @@ def test_measurements_are_as_old_as_the_exchange_makes_them(hand):
     """An exchange begins every 12 ms, and its answer is there 9.6 ms later."""
     run, plant, _ = virtual(hand, "rotate", lambda k, target: target + 0.01, seconds=0.1)
     heard = []
-    see = run.safety.see
-    run.safety.see = lambda sample: (heard.append((sample.time, plant.time)), see(sample))
+    update = run.safety.update
+    run.safety.update = lambda sample: (heard.append((sample.time, plant.time)), update(sample))
     run.run()
     times = np.array([time for time, _ in heard])
     assert times[0] == pytest.approx(0.0096)
