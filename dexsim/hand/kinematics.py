@@ -150,16 +150,20 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
 
 
+def finger_bodies(hand: Hand, finger: int) -> list[int]:
+    """Bodies from a fingertip's to the palm's."""
+    bodies = [int(hand.tip_body[finger])]
+    while (above := int(hand.body_parent[bodies[-1]])) >= 0:
+        bodies.append(above)
+    return bodies
+
+
 def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
     """Joint indices of these fingers from their root joint to the tip, but those that swing the finger sideways: hinges
     whose axes are not parallel to the root joint's."""
-    frames = _drawn_frames(hand)
-    joints = set[int]()
+    frames, joints = _drawn_frames(hand), set[int]()
     for finger in fingers:
-        body, chain = int(hand.tip_body[finger]), list[int]()
-        while body >= 0:
-            chain.append(body)
-            body = int(hand.body_parent[body])
+        chain = finger_bodies(hand, finger)
         root = [place for place, body in enumerate(chain) if hand.body_joint[body] == hand.root_joint[finger]]
         axes = np.stack([frames[body] @ hand.joint_axis[body] for body in chain])
         for body, cosine in zip(chain[: root[-1] + 1], np.abs(axes @ axes[root[-1]]), strict=False):

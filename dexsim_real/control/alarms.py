@@ -6,7 +6,7 @@ public, so every bit counts unless it is listed as harmless. Each finding is one
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.kinematics import Hand, finger_bodies
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
@@ -20,12 +20,9 @@ _UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and ans
 
 
 def finger_joints(hand: Hand, finger: int) -> list[int]:
-    """Joints from the palm to a fingertip."""
-    body, joints = int(hand.tip_body[finger]), list[int]()
-    while body >= 0:
-        joints += [int(hand.body_joint[body])] if hand.body_joint[body] >= 0 else []
-        body = int(hand.body_parent[body])
-    return list(dict.fromkeys(joints[::-1]))  # a motor may move two
+    """Joint indices of a finger from the palm to its tip, each once: a motor may move two hinges."""
+    joints = [int(hand.body_joint[body]) for body in reversed(finger_bodies(hand, finger))]
+    return list(dict.fromkeys(joint for joint in joints if joint >= 0))
 
 
 def joint_labels(hand: Hand) -> tuple[str, ...]:

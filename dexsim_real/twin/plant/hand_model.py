@@ -20,7 +20,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.kinematics import Hand, finger_bodies
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF
@@ -192,10 +192,8 @@ def _carriers(model: mujoco.MjModel, body: int) -> set[int]:
 
 def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, given: tuple[str, ...]) -> int:
     """The site at the tip of a finger: the named one, the only one, or the one with "tip" in its name."""
-    body = int(hand.tip_body[finger])
-    while hand.body_joint[body] < 0:
-        body = int(hand.body_parent[body])
-    joint = joints[int(hand.body_joint[body])]
+    last = next(body for body in finger_bodies(hand, finger) if hand.body_joint[body] >= 0)
+    joint = joints[int(hand.body_joint[last])]
     moved = model.body_weldid[model.jnt_bodyid[joint]]
     sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == moved]
     if given:
