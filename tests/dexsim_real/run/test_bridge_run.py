@@ -144,6 +144,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):
     assert np.all(sent >= hand.joint_lower - 1e-6) and np.all(sent <= hand.joint_upper + 1e-6)
     link = summary(tmp_path)["link"]
     assert link["corrupt"] + link["silent"] >= len(faults) > 5  # on a busy machine the peer itself may be late
+    assert link["sent"] == sum(link[end] for end in ("answered", "corrupt", "silent", "refused", "lost"))
     assert replay.replay(tmp_path / "run.log").report["first_difference"] is None
 
 
