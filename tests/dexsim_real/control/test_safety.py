@@ -324,7 +324,7 @@ def test_too_much_force_eases_slowly_toward_the_measured_pose(bench, way):
     target = MIDDLE + way * np.float32(0.1) * FREE
     path = [bench.run(0.5, target=target, follow=False)[-1].position]
     path += [d.position for d in bench.run(0.5, target=target, follow=False, force=30.0)]
-    np.testing.assert_allclose(np.diff(path, axis=0)[:8, FREE > 0], -way * 0.5 * CYCLE, rtol=1e-3)
+    np.testing.assert_allclose(np.diff(path, axis=0)[:8, FREE > 0], -way * 0.475 * CYCLE, rtol=1e-3)
     np.testing.assert_allclose(path[-1], MIDDLE, atol=1e-6)
 
 
