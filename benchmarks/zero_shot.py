@@ -4,7 +4,7 @@
     python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
     python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2 --json grasp.json
     python benchmarks/zero_shot.py --task grasp --trials 25 --limit speed=20 --limit margin=0
-    python benchmarks/zero_shot.py --task grasp --trials 20 --plant-model assets/plants/foreign_right.xml
+    python benchmarks/zero_shot.py --task grasp --trials 20 --plant-model assets/plants/foreign_right.xml --pictures out
 
 In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
 controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from zero_shot_metrics import metrics, simulated, table
+from zero_shot_metrics import draw_losses, metrics, simulated, table
 
 from dexsim.core import cli
 from dexsim_real.control.limits import SafetyConfig
@@ -165,6 +165,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--processes", type=_whole(1), default=1, help="trials at once")
     add("--first", type=_whole(0), default=0, help="number of the first trial")
     add("--json", type=Path, help="file for all results")
+    add("--pictures", type=Path, metavar="FOLDER", help="for a picture of each cause of a loss")
     given = parser.parse_args(argv)
     given.set, given.limit, given.policy = dict(given.set), dict(given.limit), given.policy or given.task
     if given.seconds is not None and not 0.0 < given.seconds < np.inf:
@@ -203,7 +204,8 @@ def _pair(text: str) -> tuple[str, float | str]:
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     options = vars(arguments(argv))
-    json, trials, processes, baseline = (options.pop(name) for name in ("json", "trials", "processes", "baseline"))
+    names = ("json", "pictures", "trials", "processes", "baseline")
+    json, pictures, trials, processes, baseline = (options.pop(name) for name in names)
     task, policy = options["task"], options["policy"]
     reports = run_all(options, trials, processes, show=True)
     still = run_all(options | {"idle": True}, trials, processes, show=False) if baseline else []
@@ -215,6 +217,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     seeds = " ".join(map(str, options["seed"]))
     print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}; targets {TARGETS[task]}")
     print(table(here, there, idle))
+    if pictures:
+        print(*draw_losses(pictures, load(policy, False)[0], reports), sep="\n")
     return 0
 
 

@@ -1,6 +1,7 @@
 """What the trials of `zero_shot.py` amount to: metrics, and a table beside the policy's report in simulation."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,10 @@ from dexsim.core.assets import asset_path
 from dexsim.core.errors import DexsimError
 from dexsim.core.statistics import mean, proportion, ratio
 from dexsim.force_loop import target_force
+from dexsim.hand.kinematics import Hand
+from dexsim.render.snapshot import Snapshot
 from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
+from dexsim_real.twin.plant.shapes import matrix
 
 
 def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
@@ -76,12 +80,51 @@ def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """The metrics of a policy's trials."""
+    """The metrics of a policy's trials, with a count of the causes of losses."""
+    causes = Counter(r["end"].removeprefix("dropped: ") for r in reports if r["end"].startswith("dropped"))
+    lost = {"lost": dict(causes.most_common())}
     if task == "rotate":
-        return rotate_metrics(reports)
+        return rotate_metrics(reports) | lost
     from dexsim_ppo.policy import load_policy
 
-    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
+    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"])) | lost
+
+
+def draw_losses(folder: Path, hand: Hand, reports: list[dict[str, Any]]) -> list[Path]:
+    """A picture of the first loss of each cause, half a second before its end: the library's hand at the true joint
+    angles, with the true object."""
+    from PIL import Image
+
+    from dexsim.render.render import render_frame
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for report in reports:
+        cause = report["end"].removeprefix("dropped: ").replace(" ", "_")
+        path = folder / f"{report['task']}_{cause}.png"
+        if "before" not in report or path in paths:
+            continue
+        parts, before = report["parts"], report["before"]
+        size = np.zeros((len(parts), 3))
+        for row, part in zip(size, parts, strict=True):
+            row[: len(part["size"])] = part["size"]
+        snapshot = Snapshot(
+            joint_position=np.array(before["joint_position"]),
+            object_position=np.array(before["object_position"]),
+            object_rotation=matrix(np.array(before["object_quat"])),
+            primitive_size=size,
+            primitive_position=np.array([part["place"] for part in parts]),
+            primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
+            primitive_active=np.ones(len(parts), bool),
+            taxel_force=np.zeros((hand.num_fingers, hand.num_taxels)),
+            command=np.float32(report["command"]),
+            target_force=np.float32(0),
+            finger_force=np.array(before["finger_force"]),
+        )
+        picture = render_frame(hand, tuple(part["kind"] for part in parts), snapshot, camera=report["task"])
+        Image.fromarray(picture).save(path)
+        paths.append(path)
+    return paths
 
 
 def simulated(task: str, policy: str) -> dict[str, Any]:
@@ -122,7 +165,7 @@ def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> 
         return next((row for row in metrics.get("by_command", []) if row["command"] == command), {})
 
     force = "finger_force"
-    names = [name for name in here if isinstance(here[name], dict)]
+    names = [name for name in here if isinstance(here[name], dict) and name != "lost"]
     rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name)), cell(idle.get(name))) for name in names]
     for entry in here.get("by_command", []):
         other, still = (at(metrics, entry["command"]) for metrics in (there, idle))
@@ -138,6 +181,8 @@ def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> 
     rows = [("", "emulated hand", "simulation", "doing nothing"), *rows]
     widths = [max(len(row[k]) for row in rows) for k in range(4)]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if here.get("lost"):
+        lines.append("lost: " + ", ".join(f"{cause} {count}" for cause, count in here["lost"].items()))
     if "window_s" in here:
         lines.append("forces and r: of held objects, from {:g} to {:g} s after release".format(*here["window_s"]))
     return "\n".join(lines)

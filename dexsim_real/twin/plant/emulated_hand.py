@@ -255,6 +255,7 @@ class EmulatedHand:
             "parameter_kind": self.kind,
             "plant": self._model.name,
             "shape": self.shape.name,
+            "parts": [dataclasses.asdict(part) for part in self.shape.parts],
             "stage": self.stage.value,
             **self._referee.report(),
             "parameters": {name: np.round(value, 6).tolist() for name, value in values.items()},
@@ -316,8 +317,10 @@ class EmulatedHand:
             quat,
             matrix(quat) @ data.qvel[dof + 3 : dof + 6],
             {"force": np.linalg.norm(force, axis=-1), "normal": normal, "taxels": taxels},
+            self.true_pose()[0],
             data.qvel[scene.drive_dof],
             self._drives.at_limit(),
+            self._pushes.acting,
         )
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
             self._referee.end = "dropped: the physics failed"
@@ -347,6 +350,11 @@ class Pushes:
         self._parameters, self._rng = parameters, rng
         self._until: float | None = None  # s, end of the push that lasts
         self._at = np.inf  # s, of the next push
+
+    @property
+    def acting(self) -> bool:
+        """Whether a push acts now."""
+        return self._until is not None
 
     def begin(self, time: float) -> None:
         """The object is free from a time in s."""

@@ -3,10 +3,20 @@
 No sensor, calibration or goal of the runner is used. The rules are those of the tasks. A grasped object is lost beyond
 0.12 m from its nominal position. A cube has reached a goal within 0.3 rad and 0.05 m (the paper's count) and at no more
 than 2 rad/s (the task's count); it is lost beyond 0.07 m, or when tipped by 1 rad.
+
+A loss has one of these causes, the first that holds:
+
+- untouched: no two fingertips ever touched the object at once
+- disturbed: a push acted on it within the last half second
+- trapped: a cube stood tilted on one fingertip or none for most of the last two seconds
+- at the torque limit: a joint was, for most of the last half second with a touch
+- tipped: a cube's axis left the palm's normal
+- pushed out, slipped: a fingertip touched in the last 0.2 s, or none did
 """
 
+import collections
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +33,20 @@ TOUCH = 0.1  # N above which a fingertip counts as touching (for forces of a gra
 _GRIP = 0.01  # N
 _SETTLE = 3.0  # s after release before forces count
 _RECENT = 0.2  # s; a fingertip that touched this shortly before a drop pushed the object out
+_LEAD, _TRAP = 0.5, 2.0  # s before a drop in which its cause shows; in which a trap does
+_TRAPPED = 0.35  # rad, tilt of a cube in a trap
 _AXIS = np.array([1.0, 0.0, 0.0])
+
+
+class _Moment(NamedTuple):
+    """What may tell the cause of a loss, at one time."""
+
+    time: float  # s
+    touching: int  # fingertips
+    tilt: float  # rad
+    limited: bool  # a joint is at its torque limit
+    disturbed: bool  # a push acts
+    pose: dict[str, np.ndarray]  # joint angles, object and forces, for a picture
 
 
 class Referee:
@@ -45,6 +68,8 @@ class Referee:
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
         self._heading: float | None = None  # rad, at the release
+        self._moments: collections.deque[_Moment] = collections.deque()
+        self._gripped = False  # whether two fingertips ever touched at once
 
     def watch(
         self,
@@ -53,8 +78,10 @@ class Referee:
         quat: np.ndarray,
         spin: np.ndarray,
         forces: dict[str, np.ndarray],
+        joint_position: np.ndarray,
         joint_speed: np.ndarray,
         at_limit: np.ndarray,
+        disturbed: bool,
     ) -> None:
         """Update with the current state.
 
@@ -62,8 +89,9 @@ class Referee:
           step: s since the last update.
           position, quat, spin: [3] m, [4], [3] rad/s of the object, palm frame.
           forces: [5] N on the fingertips: "force" whole, "normal" along the contact's normal, "taxels" on the taxels.
-          joint_speed: [12] rad/s.
+          joint_position, joint_speed: [12] rad, [12] rad/s.
           at_limit: [12] bool, joints at their torque limit.
+          disturbed: whether a push acts on the object.
         """
         if self.end:
             return
@@ -76,9 +104,14 @@ class Referee:
         away = float(np.linalg.norm(position - self._reference))
         tilt = math.acos(float(np.clip(matrix(quat)[:, 0] @ _AXIS, -1.0, 1.0)))
         rotate = self.task == "rotate"
+        pose = {"joint_position": joint_position, "object_position": position, "object_quat": quat}
+        pose["finger_force"] = forces["force"]
+        self._gripped |= int(touching.sum()) >= 2
+        self._moments.append(_Moment(self.time, int(touching.sum()), tilt, bool(at_limit.any()), disturbed, pose))
+        while self._moments[0].time < self.time - _TRAP:
+            self._moments.popleft()
         if away > LOST[self.task] or (rotate and tilt > TIPPED):
-            pushed = self.time - self._touched <= _RECENT
-            self.end = f"dropped: {'tipped' if away <= LOST[self.task] else 'pushed out' if pushed else 'slipped'}"
+            self.end = f"dropped: {self._cause(away)}"
             return
         if rotate:
             self._count_goals(quat, away, float(spin @ _AXIS))
@@ -93,6 +126,23 @@ class Referee:
             self._limited += bool(np.any(at_limit))
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
+
+    def _cause(self, away: float) -> str:
+        """Why the object is lost, which now is `away` m from its place; see the head of this module."""
+        last = [moment for moment in self._moments if moment.time >= self.time - _LEAD]
+        touched = [moment.limited for moment in last if moment.touching]
+        trapped = [moment.tilt > _TRAPPED and moment.touching <= 1 for moment in self._moments]
+        if not self._gripped:
+            return "untouched"
+        if any(moment.disturbed for moment in last):
+            return "disturbed"
+        if self.task == "rotate" and self.time > _TRAP and np.mean(trapped) > 0.7:
+            return "trapped"
+        if touched and np.mean(touched) > 0.5:
+            return "at the torque limit"
+        if away <= LOST[self.task]:
+            return "tipped"
+        return "pushed out" if self.time - self._touched <= _RECENT else "slipped"
 
     def _count_goals(self, quat: np.ndarray, away: float, spin: float) -> None:
         """Goals are 90 degrees apart about the palm's normal, from the first heading on."""
@@ -118,6 +168,9 @@ class Referee:
             "duty": np.round(self._duty / lived, 4).tolist(),
             "joint_speed": round(self._speed / lived, 4),
         }
+        if self.end.startswith("dropped") and self._moments:
+            before = next(moment for moment in self._moments if moment.time >= self.time - _LEAD)
+            report["before"] = {name: np.round(value, 4).tolist() for name, value in before.pose.items()}
         if self.task == "grasp":
             return report | {
                 "held": self.end == "time limit",

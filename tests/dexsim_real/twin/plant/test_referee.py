@@ -14,7 +14,8 @@ from dexsim_real.twin.plant.shapes import product, turn
 def look(judge, quat, spin=0.0, away=0.0, step=0.01):
     """One look at a cube that nobody touches, `away` m from its nominal position."""
     position, forces = np.array(REFERENCES["rotate"]) + (away, 0, 0), dict.fromkeys(("force", "normal"), np.zeros(5))
-    judge.watch(step, position, quat, np.array([spin, 0, 0]), forces, np.zeros(12), np.zeros(12, bool))
+    spin, still = np.array([spin, 0, 0]), np.zeros(12)
+    judge.watch(step, position, quat, spin, forces, still, still, np.zeros(12, bool), disturbed=False)
 
 
 def spinning(rate, seconds, heading=0.05, step=0.01):
@@ -43,13 +44,17 @@ def test_a_goal_needs_the_whole_orientation_and_the_place():
     assert judge.goals["task"] == 1
 
 
-def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0)):
+def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0), limited=0.0, push=()):
+    """A trial with a look each 10 ms; `limited`: share of looks with a joint at its limit, `push`: when one acts."""
     judge = Referee(task, seconds)
     for k, position in enumerate(positions):
-        force = np.full(5, tips(k) if callable(tips) else tips)
-        forces = {"force": force, "normal": force, "taxels": force}
-        quat, still = np.asarray(quat, float), np.zeros(3)
-        judge.watch(0.01, np.asarray(position), quat, still, forces, np.full(12, 0.5), np.zeros(12, bool))
+        force = np.broadcast_to(tips(k) if callable(tips) else tips, 5).astype(float)
+        forces, still = {"force": force, "normal": force, "taxels": force}, np.zeros(3)
+        at_limit = np.arange(12) < (k % 10 < 10 * limited)
+        now = np.asarray(quat(k) if callable(quat) else quat, float)
+        judge.watch(
+            0.01, np.asarray(position), now, still, forces, np.full(12, 0.3), np.full(12, 0.5), at_limit, k in push
+        )
     return judge
 
 
@@ -60,10 +65,20 @@ def test_drops_and_their_causes():
     assert slipped["end"] == "dropped: slipped" and slipped["seconds_to_fall"] == pytest.approx(0.51)
     assert slipped["fell"] and slipped["duty"] == pytest.approx([0.2 / 0.51] * 5, abs=1e-3)
     assert slipped["joint_speed"] == pytest.approx(0.5)
+    assert slipped["before"]["object_position"] == pytest.approx(place, abs=1e-4)
     assert watched("rotate", away, tips=1.0).end == "dropped: pushed out"
-    assert watched("rotate", [place], quat=turn((0, 1, 0), 1.05)).end == "dropped: tipped"
+    assert watched("rotate", away).end == "dropped: untouched"
+    assert watched("rotate", away, tips=1.0, limited=0.8).end == "dropped: at the torque limit"
+    assert watched("rotate", away, tips=1.0, limited=0.2, push=range(10, 20)).end == "dropped: disturbed"
+    over = lambda k: turn((0, 1, 0), 1.05 if k == 50 else 0.0)  # noqa: E731
+    assert watched("rotate", [place] * 51, quat=over, tips=1.0).end == "dropped: tipped"
+    lean = lambda k: turn((0, 1, 0), 0.0 if k < 100 else 0.6 if k < 350 else 1.05)  # noqa: E731
+    middle = lambda k: (np.arange(5) == 2) * 12.0 if k >= 100 else 1.0  # noqa: E731
+    assert watched("rotate", [place] * 351, quat=lean, tips=middle).end == "dropped: trapped"
+    assert watched("rotate", [place] * 351, quat=lean, tips=1.0).end == "dropped: tipped"
     kept = watched("rotate", [place] * 300, seconds=2.0).report()
     assert kept["end"] == "time limit" and not kept["fell"] and kept["seconds"] == pytest.approx(2.0)
+    assert "before" not in kept
 
 
 def test_forces_of_a_grasp_are_means_from_three_seconds_on():
@@ -73,7 +88,9 @@ def test_forces_of_a_grasp_are_means_from_three_seconds_on():
         force = np.array((9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else [50.0] * 5)
         forces = {"force": force, "normal": 0.8 * force, "taxels": 0.5 * force}
         limited = np.arange(12) == (3 if k % 4 == 0 else -1)
-        judge.watch(0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), forces, np.zeros(12), limited)
+        judge.watch(
+            0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), forces, np.zeros(12), np.zeros(12), limited, False
+        )
     report = judge.report()
     assert report["held"] and report["force"] == pytest.approx([9.0, 1.0, 2.0, 0.0, 3.0])
     assert report["finger_force"] == pytest.approx(2.0) and report["total_force"] == pytest.approx(15.0)
