@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, reading small files, private folders."""
+"""Writing a file whole or not at all, and reading small files."""
 
 import contextlib
 import os
@@ -71,39 +71,3 @@ def read_small(path: Path) -> str:
 def temporary_beside(path: Path) -> Path:
     """A hidden name beside `path` for what takes its place once it is whole; another one at each call."""
     return path.with_name(f".{path.name:.200}.{secrets.token_hex(4)}.dexsim-part")
-
-
-def make_private(folder: Path) -> None:
-    """Make a folder (0700) that only this user may write to, or check that an existing one is such a folder.
-
-    Raises:
-      PermissionError: it is somebody else's, or others may write to it.
-      OSError: it cannot be made.
-    """
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    _check_private(folder, os.stat(folder))
-
-
-def _check_private(path: Path, status: os.stat_result) -> None:
-    if status.st_uid != os.geteuid():
-        raise PermissionError(f"{path} belongs to another user")
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise PermissionError(f"{path} can be written by others (chmod go-w)")
-
-
-def read_private(path: Path) -> bytes:
-    """Read a file that only this user may have written.
-
-    Raises:
-      PermissionError: it is somebody else's, a link, or others may write to it.
-      OSError: it cannot be read.
-    """
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError as error:
-        if path.is_symlink():
-            raise PermissionError(f"{path} is a link") from error
-        raise
-    with os.fdopen(handle, "rb") as file:
-        _check_private(path, os.fstat(file.fileno()))  # of what was opened, not of what may be there by now
-        return file.read()
