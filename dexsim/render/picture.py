@@ -194,7 +194,7 @@ def _paint_taxels(
     hot = (force_color(level, force_range) / 255) ** 2.2
     tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
     pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
-    radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / away
+    radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
     width, height = view.size
     for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
         left, right = max(int(x - r), 0), min(int(x + r) + 2, width)
