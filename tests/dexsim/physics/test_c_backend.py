@@ -215,14 +215,13 @@ def test_a_gradient_is_refused_by_name(physics, grips):
 
 
 class TestTrouble:
-    def test_a_world_that_diverges_is_marked_and_alone(self, physics, tick, grips):
+    def test_a_world_that_diverges_is_marked_and_alone(self, tick, grips):
         target, state, _ = batch_of(grips[:4])
         push = jnp.zeros((4, 3))
-        expected, counted = tick(target, state, push), physics.engine._engine.diverged
+        expected = tick(target, state, push)
         broken = dataclasses.replace(state, qpos=state.qpos.at[1, 3].set(jnp.nan), qvel=state.qvel.at[2, 14].set(1e12))
         after = tick(target, broken, push)
         assert np.isnan(np.asarray(after[1])[1:3]).all()
-        assert physics.engine._engine.diverged > counted
         sound = jax.tree.map(lambda x: x[np.array([0, 3])], (after, expected))
         assert_same(*sound)
         assert_same(tick(target, state, push), expected)
