@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
-from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
 
 COMMANDS = {
     "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
@@ -24,7 +23,6 @@ COMMANDS = {
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
-    "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
 }
 """Module and purpose of each command."""
@@ -40,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print("usage: dexsim COMMAND [options]\n")
         for command, (_, purpose) in COMMANDS.items():
-            print(f"  {command:20} {purpose}")
+            print(f"  {command:12} {purpose}")
         print("\ndexsim COMMAND --help shows the command's options.")
         return 0
     name, *rest = argv
@@ -49,10 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
     if name == "train":
         cli.announce(cli.LOADING)
-    exit_on_interrupt()
-    module = importlib.import_module(COMMANDS[name][0])
-    restore_interrupt()
-    return module.main(rest)
+    return importlib.import_module(COMMANDS[name][0]).main(rest)
 
 
 def console() -> None:

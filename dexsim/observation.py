@@ -149,6 +149,12 @@ class ObservationConfig(Config):
     force: ForceEstimate = setting(ForceEstimate())
     """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.add:
+            if FIELDS[name].source == "simulator":
+                raise ConfigError(f"ObservationConfig.add = {name!r}: no sensor measures it")
+
 
 GRASP = (
     "joint_position",
@@ -189,18 +195,6 @@ def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[st
     """The task's fields `names` as configured: those left out gone, those added behind them."""
     names = tuple(name for name in names if name not in config.leave_out)
     return (*names, *(name for name in dict.fromkeys(config.add) if name not in names))
-
-
-def group_configs(config: ObservationConfig) -> tuple[ObservationConfig, ObservationConfig]:
-    """The configuration as it holds for the actor and for the critic, who may always look.
-
-    Raises:
-      ConfigError: the actor is to see what nothing measures.
-    """
-    for name in config.add:
-        if FIELDS[name].source == "simulator":
-            raise ConfigError(f"ObservationConfig.add = {name!r}: no sensor measures it")
-    return config, dataclasses.replace(config, leave_out=())
 
 
 def observe(

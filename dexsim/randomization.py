@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.actuator.drive import Actuator
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniforms
@@ -47,48 +47,48 @@ class Randomization(Config):
     """Ranges (low, high), drawn uniformly for every joint or finger at every episode start."""
 
     scale: float = setting(1.0, unit="1", low=0.0, high=3.0)
-    """Width of all ranges about their nominal values; 0 switches randomisation of hands, motors and objects off, not
-    the errors of single taxels (`Sensing.taxel`)."""
+    """Width of all ranges about their nominal values; 0 switches randomisation of hands and motors off, not that of
+    objects (`ObjectConfig`), nor the errors of single taxels (`Sensing.taxel`)."""
     stiffness: float = setting(3.0, unit="Nm/rad", low=0.01, high=100.0)
     """Nominal proportional gain k_p (not published for this hand)."""
     damping: float = setting(0.1, unit="Nm s/rad", low=0.0, high=10.0)
     """Nominal derivative gain k_d."""
-    stiffness_factor: tuple[float, float] = setting((0.8, 1.2), unit="1", low=0.05, high=10.0)
+    stiffness_factor: Range = setting((0.8, 1.2), unit="1", low=0.05, high=10.0)
     """Factor on k_p."""
-    damping_factor: tuple[float, float] = setting((0.7, 1.3), unit="1", low=0.0, high=10.0)
+    damping_factor: Range = setting((0.7, 1.3), unit="1", low=0.0, high=10.0)
     """Factor on k_d."""
-    dead_band: tuple[float, float] = setting((0.0, 0.01), unit="rad", low=0.0, high=0.2)
+    dead_band: Range = setting((0.0, 0.01), unit="rad", low=0.0, high=0.2)
     """Backlash threshold epsilon; nominal 0."""
-    torque_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    torque_factor: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on the stall torque."""
-    speed_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    speed_factor: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on the no-load speed."""
-    efficiency: tuple[float, float] = setting((0.85, 1.0), unit="1", low=0.05, high=2.0)
+    efficiency: Range = setting((0.85, 1.0), unit="1", low=0.05, high=2.0)
     """Efficiency eta; nominal 1."""
-    latency: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    latency: Range = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
     """Delay from command to motor, common to all joints, in whole sub-steps; nominal 0. At most
     two control ticks are modelled."""
-    latency_spread: tuple[float, float] = setting((0.0, 0.005), unit="s", low=0.0, high=0.2)
+    latency_spread: Range = setting((0.0, 0.005), unit="s", low=0.0, high=0.2)
     """Further delay of each joint by itself (the bus serves them in turn); nominal 0."""
-    ripple: tuple[float, float] = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    ripple: Range = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
     """Amplitude of the torque ripple, as a share of the torque; nominal 0."""
-    ripple_count: tuple[float, float] = setting((20.0, 200.0), unit="1/rad", low=0.0, high=2000.0)
+    ripple_count: Range = setting((20.0, 200.0), unit="1/rad", low=0.0, high=2000.0)
     """Ripples per radian of the joint. Neither it nor the phase has a nominal value."""
-    coulomb_friction: tuple[float, float] = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    coulomb_friction: Range = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
     """Coulomb friction as a share of the joint's stall torque; nominal 0."""
-    viscous_friction: tuple[float, float] = setting((0.0, 0.01), unit="Nm s/rad", low=0.0, high=1.0)
+    viscous_friction: Range = setting((0.0, 0.01), unit="Nm s/rad", low=0.0, high=1.0)
     """Viscous friction, on top of the damping in the hand's MJCF; nominal 0."""
-    sensing_latency: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    sensing_latency: Range = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
     """Age of the readings; nominal 0. At most one control tick is modelled."""
     encoder_bias: float = setting(0.01, unit="rad", low=0.0, high=0.2)
     """Largest constant error of a joint angle, in its reading and in its motor's loop."""
-    torque_gain: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    torque_gain: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on a joint's torque reading: error of the current-to-torque calibration."""
-    taxel_gain: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    taxel_gain: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
-    pad_thickness_delta: tuple[float, float] = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
+    pad_thickness_delta: Range = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
     """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.pad_thickness`,
     `Skin.margin`); nominal 0. The maker's fingertip ends within 0.5 mm of the taxels, soft rubber yields before it
     bears load: how far out a contact begins is not known. Thicknesses below 0 count as 0."""
@@ -101,7 +101,6 @@ class Randomization(Config):
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, "ripple_count", *(name for name in NOMINAL if name not in _DEVIATIONS))
         if self.beyond and not self.extremes:
             raise ConfigError(
                 f"Randomization.beyond = {self.beyond:g} needs extremes above 0: only hands at an extreme lie beyond"

@@ -149,14 +149,7 @@ def make(
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
             raise ConfigError(f"task {task!r} takes no config: it is not a task on a hand")
-        try:
-            inspect.signature(makes).bind()
-        except TypeError:
-            raise ConfigError(f"--task {task}: must be callable without arguments") from None
-        env = makes()
-        if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
-            raise ConfigError(f"--task {task} returned a {type(env).__name__}; expected reset() and step()")
-        return env
+        return makes()
     hand = load_hand() if hand is None else hand
     return Env(make_task(task, hand, config), hand, backend=backend, seed=seed)
 

@@ -29,7 +29,7 @@ FLOORS = {
         ("env",),
         ("tasks",),
         ("registry",),
-        ("catalog", "check_hand", "randomization_check", "wrappers"),
+        ("catalog", "check_hand", "wrappers"),
         ("view",),
         ("__main__",),
         ("",),

@@ -15,9 +15,8 @@ from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
-from dexsim.core.files import is_device, make_private, write_atomic
+from dexsim.core.files import is_device, write_atomic
 from dexsim.core.install import DISTRIBUTION
-from dexsim.core.lazy_loading import restore_interrupt
 
 T = TypeVar("T")
 
@@ -28,7 +27,6 @@ LOADING = "loading JAX and MuJoCo"
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
     warnings.showwarning = _show_warning
-    restore_interrupt()
     try:
         code = main(None)
     except DexsimError as error:
@@ -83,21 +81,10 @@ def enable_caches() -> None:
     """Keep compiled programs between runs, in `$DEXSIM_CACHE` or else `~/.cache/dexsim`."""
     import jax
 
-    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or _cache("xla")
+    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(cache_path("xla"))
     jax.config.update("jax_compilation_cache_dir", path)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def _cache(name: str) -> str | None:
-    """A cache folder for compiled code, which runs when it is loaded; None if others may write to it."""
-    path = cache_path(name)
-    try:
-        make_private(path)
-    except OSError as error:
-        warnings.warn(f"no cache of compiled code: {error}", DexsimWarning, stacklevel=3)
-        return None
-    return str(path)
 
 
 def environment_report() -> dict[str, Any]:

@@ -12,7 +12,7 @@ import math
 import types
 import typing
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from dexsim.core.errors import ConfigError
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="DataclassInstance")
 _LARGEST = 2**63 - 1  # of an integer in a checkpoint
+Range = Annotated[tuple[float, float], "low and high, in order"]
+"""The type of a field that is a range (low, high)."""
 
 
 def setting(
@@ -69,7 +71,7 @@ class Config:
 def _hints(cls: type) -> dict[str, Any]:
     """The types of a class's fields; none if one of them is only imported by type checkers."""
     try:
-        return typing.get_type_hints(cls)
+        return typing.get_type_hints(cls, include_extras=True)
     except NameError:
         return {}
 
@@ -98,16 +100,6 @@ def _range_text(low: float | None, high: float | None) -> str:
     if low is not None and high is not None:
         return f"between {low:.10g} and {high:.10g}"
     return f"at least {low:.10g}" if low is not None else f"at most {high:.10g}"
-
-
-def check_ranges(config: Any, *names: str) -> None:
-    """Require that each named `(low, high)` field is ordered."""
-    for name in names:
-        low, high = getattr(config, name)
-        if low > high:
-            raise ConfigError(
-                f"{type(config).__name__}.{name} = ({low:.10g}, {high:.10g}): the first must not exceed the second"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,6 +186,12 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if origin is Annotated:
+        value = _convert(arguments[0], value, where)
+        if hint == Range and value[0] > value[1]:
+            low, high = value
+            raise ConfigError(f"{where} = ({low:.10g}, {high:.10g}): the first must not exceed the second")
+        return value
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return value if isinstance(value, hint) else from_dict(hint, value)
     if origin in (typing.Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, reading small files, private folders."""
+"""Writing a file whole or not at all, and reading TOML."""
 
 import contextlib
 import os
@@ -8,8 +8,6 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-
-_SMALL = 1 << 20  # bytes
 
 
 def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
@@ -55,55 +53,10 @@ def is_device(path: Path) -> bool:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file. ValueError: no TOML, or larger than 1 MiB. OSError: it cannot be read."""
-    return tomllib.loads(read_small(path))
-
-
-def read_small(path: Path) -> str:
-    """The text of a file, without its byte order mark. ValueError: larger than 1 MiB. OSError: it cannot be read."""
-    with open(path, "rb") as file:
-        data = file.read(_SMALL + 1)  # a device may have no end
-    if len(data) > _SMALL:
-        raise ValueError("larger than 1 MiB")
-    return data.decode("utf-8-sig")
+    """Read a TOML file, which may begin with a byte order mark. ValueError: no TOML. OSError: it cannot be read."""
+    return tomllib.loads(path.read_text("utf-8-sig"))
 
 
 def temporary_beside(path: Path) -> Path:
     """A hidden name beside `path` for what takes its place once it is whole; another one at each call."""
     return path.with_name(f".{path.name:.200}.{secrets.token_hex(4)}.dexsim-part")
-
-
-def make_private(folder: Path) -> None:
-    """Make a folder (0700) that only this user may write to, or check that an existing one is such a folder.
-
-    Raises:
-      PermissionError: it is somebody else's, or others may write to it.
-      OSError: it cannot be made.
-    """
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    _check_private(folder, os.stat(folder))
-
-
-def _check_private(path: Path, status: os.stat_result) -> None:
-    if status.st_uid != os.geteuid():
-        raise PermissionError(f"{path} belongs to another user")
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise PermissionError(f"{path} can be written by others (chmod go-w)")
-
-
-def read_private(path: Path) -> bytes:
-    """Read a file that only this user may have written.
-
-    Raises:
-      PermissionError: it is somebody else's, a link, or others may write to it.
-      OSError: it cannot be read.
-    """
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError as error:
-        if path.is_symlink():
-            raise PermissionError(f"{path} is a link") from error
-        raise
-    with os.fdopen(handle, "rb") as file:
-        _check_private(path, os.fstat(file.fileno()))  # of what was opened, not of what may be there by now
-        return file.read()

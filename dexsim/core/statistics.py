@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-
-_Z = 1.959964  # 97.5 % quantile of the normal distribution
+from scipy.stats import binomtest
 
 
 def proportion(hits: np.ndarray) -> dict:
@@ -12,13 +11,9 @@ def proportion(hits: np.ndarray) -> dict:
     n = int(hits.size)
     if n == 0:
         return {"mean": None, "low": None, "high": None, "count": 0}
-    p = float(np.mean(hits))
-    scale = 1 + _Z * _Z / n
-    middle = (p + _Z * _Z / (2 * n)) / scale
-    half = _Z * np.sqrt(p * (1 - p) / n + _Z * _Z / (4 * n * n)) / scale
-    # At 0 and 1 the interval's end is exact; rounding would miss it.
-    low, high = 0.0 if p == 0 else middle - half, 1.0 if p == 1 else middle + half
-    return {"mean": p, "low": float(low), "high": float(high), "count": n}
+    result = binomtest(int(np.sum(hits)), n)
+    interval = result.proportion_ci(method="wilson")
+    return {"mean": result.statistic, "low": float(interval.low), "high": float(interval.high), "count": n}
 
 
 def mean(values: np.ndarray, samples: int = 500) -> dict:

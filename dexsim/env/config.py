@@ -4,8 +4,8 @@ import dataclasses
 
 from dexsim.control import Control
 from dexsim.core.config import Config, setting
+from dexsim.geometry.distance import METHODS
 from dexsim.objects.config import ObjectConfig
-from dexsim.objects.touch_geometry import TOUCH_METHODS
 from dexsim.observation import ObservationConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.randomization import Randomization
@@ -33,6 +33,6 @@ class EnvConfig(Config):
     """What the policy sees."""
     pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)
     """Start states generated once; every episode starts from one of them. An evaluation generates its own."""
-    touch_method: str = setting("closed_form", choices=TOUCH_METHODS)
+    touch_method: str = setting("closed_form", choices=METHODS)
     """How far a taxel is from the object: closed forms of the solver's primitives (for a mesh: of the boxes that
     follow it), a grid baked from the mesh, or the nearest of points on the surface, as in the paper."""

@@ -15,7 +15,6 @@ import numpy as np
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
 from dexsim.env.state import Start, State
-from dexsim.env.task import Task
 from dexsim.geometry import rotations
 from dexsim.render.snapshot import Snapshot
 
@@ -40,8 +39,19 @@ class Evaluation:
         self.evaluation, self.evaluation_steps = env.task.evaluation, env.task.evaluation_ticks
 
     def evaluation_plan(self, count: int, seed: int) -> EvaluationPlan:
-        """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own (host)."""
-        return make_plan(self.env.task, count, seed)
+        """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own, with rows
+        enough for them (host). Raises ConfigError: see `Task.make_pool`."""
+        task, key, pool = self.env.task, jax.random.key(seed), None
+        pool_key = jax.random.fold_in(key, _POOL)
+        for part in itertools.count():
+            rows: Any = jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(pool_key, part)))
+            pool = rows if pool is None else jax.tree.map(lambda *parts: np.concatenate(parts), pool, rows)
+            row, goal = task.evaluation_plan(count, pool.object.shape_index)
+            # A plan that repeats rows of a pool twice as large means to.
+            if len(np.unique(row)) == count or len(pool.qpos) >= 2 * count:
+                break
+        keys = jax.random.split(jax.random.fold_in(key, _EPISODES), count)
+        return EvaluationPlan(keys, np.asarray(row), jax.tree.map(lambda rows: rows[np.asarray(row)], pool), goal)
 
     def evaluation_starts(self, plan: EvaluationPlan) -> State:
         """[N] start states of a plan, or of a slice of one."""
@@ -81,23 +91,3 @@ def take_snapshot(env: Env, state: State) -> Snapshot:
         turns=env.task.turns(state.goal),
         seconds=state.length.astype(jnp.float32) * env.control_period,
     )
-
-
-def make_plan(task: Task, count: int, seed: int) -> EvaluationPlan:
-    """The plan of `count` episodes, from a pool with rows enough for them.
-
-    Raises:
-      ConfigError: see `Task.make_pool`.
-    """
-    key = jax.random.key(seed)
-    pool_key = jax.random.fold_in(key, _POOL)
-    pool: Any = None
-    for part in itertools.count():
-        rows = jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(pool_key, part)))
-        pool = rows if pool is None else jax.tree.map(lambda *parts: np.concatenate(parts), pool, rows)
-        row, goal = task.evaluation_plan(count, pool.object.shape_index)
-        # A plan that repeats rows of a pool twice as large means to.
-        if len(np.unique(row)) == count or len(pool.qpos) >= 2 * count:
-            break
-    keys = jax.random.split(jax.random.fold_in(key, _EPISODES), count)
-    return EvaluationPlan(keys, np.asarray(row), jax.tree.map(lambda rows: rows[np.asarray(row)], pool), goal)

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 
 from dexsim import observation
-from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.task import GroundTruth, Task
 from dexsim.hand.kinematics import Hand
@@ -16,16 +15,13 @@ class Observer:
     """What each group of a task observes. Pure methods, for one environment."""
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
-        """Raises ConfigError: nothing is left to observe, or see `group_configs`."""
         self.hand, self.fields = hand, task.fields
-        self._actor, self._critic = observation.group_configs(config.observation)
+        self._actor = config.observation
+        self._critic = dataclasses.replace(config.observation, leave_out=())  # it may always look
         self.layout = {
             "actor": observation.layout(hand, task.fields["actor"], self._actor),
             "critic": observation.layout(hand, task.fields["critic"], self._critic),
         }
-        if not self.layout["actor"]:
-            left_out = config.observation.leave_out
-            raise ConfigError(f"ObservationConfig.leave_out = {left_out}: removes every actor observation")
 
     def observe(
         self, readings: Readings, truth: GroundTruth, goal: tuple[jax.Array, jax.Array]

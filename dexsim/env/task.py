@@ -43,7 +43,7 @@ class GroundTruth:
     finger_force: jax.Array
     """[F, 3] N, of the object on the finger tips."""
     normal_force: jax.Array
-    """[F] N of it, into the skin; 0 where the finger touches with no skin."""
+    """[F] N of it, into the skin; 0 where the finger touches with no taxel."""
     touch: Touch
     """Depth and force of every taxel."""
     tip_stiffness: jax.Array
@@ -81,7 +81,7 @@ class Task(abc.ABC):
     episode_ticks: int
     """Time limit of a training episode, control ticks."""
     slots: tuple[str, ...]
-    """Kinds of the primitives [K] that objects consist of: "box", "capsule", "cylinder", "ellipsoid"."""
+    """Kinds of the primitives [K] that objects consist of: "box", "capsule", "cylinder"."""
     largest: np.ndarray
     """[K, 3] m, upper bound of each primitive's size."""
     evaluation_ticks: int

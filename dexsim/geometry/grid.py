@@ -1,4 +1,4 @@
-"""Signed-distance grids: baked once from any closed mesh (or union of primitives), looked up by interpolation.
+"""Signed-distance grids: baked once from any closed mesh, looked up by interpolation.
 
 Nodes hold the exact distance; where the surface is curved they are lowered by the mean overshoot of linear
 interpolation between the 8 nodes round a point. The normal is the analytic gradient of the interpolant, from the same
@@ -18,7 +18,6 @@ import numpy as np
 from dexsim.core.assets import cached_arrays
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.geometry import mesh as meshes
-from dexsim.geometry import sdf
 
 NODES = 64
 """Along each axis; the spacing differs per axis, so that thin objects get fine cells."""
@@ -40,20 +39,20 @@ class Grid:
     scale: jax.Array  # [] the object's size relative to the baked one
 
 
-def bake(source: meshes.Mesh | sdf.Shape, *, nodes: int = NODES) -> Grid:
-    """The grid of a checked mesh (`mesh.load_mesh`) or of a union of primitives; that of a mesh is kept in the cache.
+def bake(mesh: meshes.Mesh, *, nodes: int = NODES) -> Grid:
+    """The grid of a checked mesh (`mesh.load_mesh`), which is kept in the cache.
 
     Raises:
       AssetError: the mesh cannot be signed.
     """
-    low, high = source.bounds if isinstance(source, meshes.Mesh) else sdf.bounds(source)
-    axes = [np.linspace(a - PAD, b + PAD, nodes) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    if isinstance(source, meshes.Mesh):
-        key = f"{source.fingerprint} {nodes} {PAD!r} {_VERSION}"
-        distance = cached_arrays("sdf", key, lambda: _measure(source, points))["distance"]
-    else:
-        distance = np.asarray(sdf.signed_distance(jnp.asarray(points, jnp.float32), source))
+    axes = [np.linspace(low - PAD, high + PAD, nodes) for low, high in mesh.bounds.T]
+    key = f"{mesh.fingerprint} {nodes} {PAD!r} {_VERSION}"
+    return from_distances(axes, cached_arrays("sdf", key, lambda: _measure(mesh, axes))["distance"])
+
+
+def from_distances(axes: list[np.ndarray], distance: np.ndarray) -> Grid:
+    """The grid of distances [n^3] m at the nodes of three axes [n] m, the last one fastest."""
+    nodes = len(axes[0])
     lowered = ((distance - _overshoot(distance, axes)) / _MILLI).astype(np.float32)
     # No cell begins at an axis' last node: what is rolled there is never read.
     corners = np.stack([np.roll(lowered, -((x * nodes + y) * nodes + z)) for x, y, z in np.ndindex(2, 2, 2)], -1)
@@ -142,7 +141,8 @@ def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     return np.where(smooth, total, 0.0).reshape(-1)
 
 
-def _measure(mesh: meshes.Mesh, points: np.ndarray) -> dict[str, np.ndarray]:
+def _measure(mesh: meshes.Mesh, axes: list[np.ndarray]) -> dict[str, np.ndarray]:
     """Exact distance at the nodes, m."""
     meshes.check_sign(mesh)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return {"distance": meshes.signed_distance(mesh, points)[0].astype(np.float32)}

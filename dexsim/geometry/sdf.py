@@ -1,8 +1,8 @@
 """Signed distances to closed-form primitives and their unions.
 
-Sizes are MuJoCo's: box half-extents; capsule and cylinder (radius, half-length, -) along z; sphere (radius, -, -);
-ellipsoid semi-axes. Distances are negative inside, and exact but for points inside an overlap of several primitives,
-where a union gives the depth below the nearest of their surfaces, not below the outer one.
+Sizes are MuJoCo's: box half-extents; capsule and cylinder (radius, half-length, -) along z; sphere (radius, -, -).
+Distances are negative inside, and exact but for points inside an overlap of several primitives, where a union gives the
+depth below the nearest of their surfaces, not below the outer one.
 """
 
 from collections.abc import Iterable
@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import Array, align, pytree_dataclass, static
+from dexsim.core.pytree import Array, pytree_dataclass, static
 
-KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid")
+KINDS = ("sphere", "box", "capsule", "cylinder")
 FAR = 1e3  # m, the distance to a primitive that is switched off
 _TINY = 1e-20  # keeps the gradient of a norm finite at zero
 
@@ -55,34 +54,7 @@ def cylinder(point: Array, size: Array) -> jax.Array:
     return outside + jnp.minimum(jnp.maximum(radial, axial), 0.0)
 
 
-def ellipsoid(point: Array, size: Array) -> jax.Array:
-    """Exact distance by Newton's method for the nearest surface point.
-
-    The nearest point is q = s^2 p / (t + s^2) with t the largest root of
-    g(t) = sum (s p / (t + s^2))^2 - 1. g is convex and falling there, so Newton from the left
-    converges monotonically. The unknown is u = t + min(s)^2: deep inside t is all but -min(s)^2
-    and the sum would cancel. The distance n.(p - q), with n and the unit vector q / s held
-    fixed, has the exact gradient in point and size (envelope theorem).
-    """
-    p = jax.lax.stop_gradient(jnp.abs(point)) + 1e-9
-    s = jax.lax.stop_gradient(size)
-    least = jnp.min(s)
-    gap, s, size = (align(x, point) for x in ((s - least) * (s + least), s, size))
-    # Each term alone must not exceed one at the root, so this start lies left of it.
-    u = jnp.max(s * p - gap, axis=-1)
-    for _ in range(12):
-        shift = u[..., None] + gap
-        term = s * p / shift
-        value = jnp.sum(term**2, -1) - 1.0
-        u = u + 0.5 * value / jnp.sum(term**2 / shift, -1)
-    unit = s * p / (u[..., None] + gap)
-    normal = unit / s
-    normal = normal / _norm(normal)[..., None]
-    sign = jnp.where(jax.lax.stop_gradient(point) < 0, -1.0, 1.0)
-    return jnp.sum(normal * (sign * point - size * unit), -1)
-
-
-_DISTANCE = {"sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder, "ellipsoid": ellipsoid}
+_DISTANCE = {"sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder}
 
 
 def primitive_distance(kind: str, points: Array, size: Array) -> jax.Array:
@@ -124,33 +96,6 @@ def of_geoms(geoms: Iterable[Any]) -> Shape | None:
     )
 
 
-def bounds(shape: Shape) -> np.ndarray:
-    """Lowest and highest corner [2, 3] m of the active primitives' bounding boxes.
-
-    Raises:
-      ConfigError: nothing is active.
-    """
-    active = np.flatnonzero(np.asarray(shape.active))
-    if not active.size:
-        raise ConfigError("bounds: no active primitive")
-    position = np.asarray(shape.position, float)[active]
-    size, turn = np.asarray(shape.size, float), np.asarray(shape.rotation, float)
-    reach = np.stack([_reach(shape.kinds[k], size[k], turn[k]) for k in active])
-    return np.stack([(position - reach).min(0), (position + reach).max(0)])
-
-
-def _reach(kind: str, size: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Half the sides [3] of the axis-aligned box round one turned primitive."""
-    along = np.minimum(np.abs(turn[:, 2]), 1.0)
-    if kind == "box":
-        return np.abs(turn) @ size
-    if kind == "ellipsoid":
-        return np.linalg.norm(turn * size, axis=1)
-    if kind == "cylinder":
-        return size[0] * np.sqrt(1 - along**2) + size[1] * along
-    return size[0] + (size[1] * along if kind == "capsule" else np.zeros(3))
-
-
 def distance_and_normal(points: Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
     """Distance [...] m and outward unit normal [..., 3] of the nearest surface, object frame."""
     distance, pullback = jax.vjp(lambda p: signed_distance(p, shape), points)
@@ -164,7 +109,3 @@ def _split(point: Array) -> tuple[Array, Array, Array]:
 
 def _length(*parts: Array) -> jax.Array:
     return jnp.sqrt(sum(part * part for part in parts) + _TINY)
-
-
-def _norm(vector: Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(vector * vector, -1) + _TINY)

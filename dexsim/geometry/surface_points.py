@@ -126,12 +126,6 @@ def _sphere_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     return size[0] * out, out
 
 
-def _ellipsoid_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
-    unit = jnp.asarray(_fibonacci(count))
-    out = unit / size[None]
-    return unit * size[None], out / jnp.linalg.norm(out, axis=-1, keepdims=True)
-
-
 def _capsule_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     """Even along the axis with the share of area on tube and caps (both have 2 pi r per unit of height)."""
     radius, half = size[0], size[1]
@@ -177,5 +171,4 @@ _TEMPLATES = {
     "box": _box_points,
     "capsule": _capsule_points,
     "cylinder": _cylinder_points,
-    "ellipsoid": _ellipsoid_points,
 }

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 
@@ -30,7 +30,7 @@ class Excitation(Config):
     """Standing still at the beginning and between the signals."""
     amplitude: float = setting(0.3, unit="rad", low=0.005, high=1.5)
     """Of chirp, steps and slow triangles about the middle posture; cut to the joint's range."""
-    chirp_frequency: tuple[float, float] = setting((0.3, 4.0), unit="Hz", low=0.01, high=50.0)
+    chirp_frequency: Range = setting((0.3, 4.0), unit="Hz", low=0.01, high=50.0)
     """First and last frequency of the chirp."""
     chirp_seconds: float = setting(4.0, unit="s", low=0.0, high=120.0)
     """Length of the chirp; its amplitude falls with the frequency to a quarter."""
@@ -41,10 +41,6 @@ class Excitation(Config):
     """Steps, of alternating sign and two sizes."""
     reversal_cycles: int = setting(4, unit="1", low=0, high=200)
     """Small reversals, once up and down each."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "chirp_frequency")
 
 
 def chirp(seconds: float, period: float, frequency: tuple[float, float]) -> np.ndarray:

@@ -1,11 +1,10 @@
 """Which objects are drawn, and from which ranges."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.objects.mesh import MeshObject, load
 
@@ -28,7 +27,6 @@ RANGES = (*SIZE_RANGES, *PROPERTY_RANGES)
 """Fields of `ObjectConfig` that are drawn for every object."""
 MESH_RANGES = ("mesh_size", *PROPERTY_RANGES)
 """Those of a mesh."""
-_SPANS = tuple(name for name in (*RANGES, "mesh_size") if name != "com_offset")  # pairs (low, high)
 SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -39,46 +37,44 @@ class ObjectConfig(Config):
 
     shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)
     """Kinds of object, drawn with equal probability."""
-    scale: float = setting(1.0, unit="1", low=0.0, high=1.0)
-    """Width of all ranges about their middles; 0 leaves one object of each kind."""
     mesh: str = setting("")
     """File of a closed mesh (STL, OBJ, PLY, ...) that replaces `shapes`. Its z axis is across the
     fingers in a grasp, its x axis is normal to the palm in a rotation."""
     mesh_unit: float = setting(1.0, unit="m", low=1e-6, high=100.0)
     """Length of that file's unit: 0.001 for millimetres."""
-    mesh_size: tuple[float, float] = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
+    mesh_size: Range = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
     """Factor on the mesh's size."""
     mesh_parts: int = setting(6, unit="1", low=1, high=24)
     """Largest number of boxes that approximate the mesh in the solver; its cost grows with them."""
-    sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
+    sphere_radius: Range = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
     """Radius of a sphere."""
-    box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    box_half: Range = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
     """Each half-extent of a box."""
-    cylinder_radius: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    cylinder_radius: Range = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
     """Radius of a cylinder or capsule."""
-    cylinder_half: tuple[float, float] = setting((0.020, 0.035), unit="m", low=0.002, high=0.10)
+    cylinder_half: Range = setting((0.020, 0.035), unit="m", low=0.002, high=0.10)
     """Half-length of a cylinder, or of a capsule's straight part."""
-    neck_radius: tuple[float, float] = setting((0.010, 0.016), unit="m", low=0.003, high=0.05)
+    neck_radius: Range = setting((0.010, 0.016), unit="m", low=0.003, high=0.05)
     """Radius of the capsule that juts out of a composition."""
-    neck_half: tuple[float, float] = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
+    neck_half: Range = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
     """Half-length of that capsule's straight part."""
     composition_scale: float = setting(0.8, unit="1", low=0.1, high=2.0)
     """Size of a composition's box or cylinder, relative to a single one."""
-    mass: tuple[float, float] = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
+    mass: Range = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
     """Mass of the object."""
-    inertia_scale: tuple[float, float] = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
+    inertia_scale: Range = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
     """Factor on the inertia of a uniform solid."""
     com_offset: float = setting(0.003, unit="m", low=0.0, high=0.05)
     """Largest offset of the centre of mass, per axis."""
-    friction: tuple[float, float] = setting((0.4, 1.2), unit="1", low=0.01, high=5.0)
+    friction: Range = setting((0.4, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between the fingertips' rubber and the object."""
-    link_friction: tuple[float, float] = setting((0.3, 1.2), unit="1", low=0.01, high=5.0)
+    link_friction: Range = setting((0.3, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between all else of the hand (palm, links) and the object."""
-    stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
+    stiffness: Range = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
     """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Fingertips
     follow their skin (`contact.follow_skin`): the middle of the default is the skin as it is, and other values make it
     that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
-    restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
+    restitution: Range = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution: the damping of the contact, which also slows creep. Values
     below 0.024 act as 0.024."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
@@ -86,21 +82,8 @@ class ObjectConfig(Config):
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, *_SPANS)
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
-
-    def narrowed(self) -> "ObjectConfig":
-        """The ranges as `scale` leaves them, and scale 1."""
-        if self.scale == 1.0:
-            return self
-
-        def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
-            low, high = span
-            return middle + self.scale * (low - middle), middle + self.scale * (high - middle)
-
-        values: dict[str, Any] = {name: narrow(getattr(self, name), nominal(self, name)) for name in _SPANS}
-        return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
     Raises:
       AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
-    config, keys, extreme = config.narrowed(), jax.random.split(key, 8), sample_extreme(key, config.extremes)
+    keys, extreme = jax.random.split(key, 8), sample_extreme(key, config.extremes)
     zero, three, quat = jnp.zeros(()), jnp.zeros(3), None
     if config.mesh:
         mesh_object = load_mesh_object(config)
@@ -136,7 +136,7 @@ def resample_properties(
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       names: the ranges, of `PROPERTY_RANGES`, that are drawn.
     """
-    drawn = _sample_properties(jax.random.split(key, 8), config.narrowed(), object.extreme)
+    drawn = _sample_properties(jax.random.split(key, 8), config, object.extreme)
     properties = _properties_of(object, plain)
     return _with_properties(object, plain, properties | {name: drawn[name] for name in names})
 
@@ -197,7 +197,7 @@ def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array,
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
-    config, properties = config.narrowed(), _properties_of(object, plain)
+    properties = _properties_of(object, plain)
     middle: dict[str, Any] = {name: 0.0 if name == "com_offset" else nominal(config, name) for name in properties}
     middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
     near = {name: middle[name] + scale * (value - middle[name]) for name, value in properties.items()}

@@ -7,11 +7,8 @@ import jax
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, surface_points
-from dexsim.geometry.distance import METHODS
 from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams
-
-TOUCH_METHODS = METHODS
 
 
 def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:

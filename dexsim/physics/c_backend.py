@@ -127,8 +127,6 @@ class HostEngine:
         self.scene = scene
         # Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
         self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
-        self.diverged = 0
-        """World-ticks so far that MuJoCo gave up: not a number, or out of bounds."""
 
     def tick(self, fields: tuple[str, ...], law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
         """A control tick of a batch; see `CBackend._call` for what crosses.
@@ -169,9 +167,7 @@ class HostEngine:
         if warning[:, _FULL].any():
             raise MemoryError("C MuJoCo has no room for all contacts: raise <size memory> in the hand's MJCF")
         force = -worlds.sensors
-        if (diverged := warning[:, _DIVERGED].any(1)).any():
-            self.diverged += int(diverged.sum())
-            force[diverged] = np.nan
+        force[warning[:, _DIVERGED].any(1)] = np.nan
         return [worlds.qpos, worlds.qvel, worlds.warmstart, force]
 
 

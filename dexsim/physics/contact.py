@@ -2,9 +2,9 @@
 
 A spring of constant stiffness gives the same force on a face, over its rim and at its corner. Skin does not: at equal
 depth the rim presses half as hard, the corner a quarter. So the stiffness of a fingertip's springs is computed at every
-tick from the skin's law over the taxels, and the skin beyond them where that bears load (`follow_skin`), and the
-solver's force is that of the skin. For this a fingertip is a row of spheres (`split_pads`). A sphere has exactly one
-contact point with a primitive, on every engine, at a depth in closed form; a capsule has one or two points on a box.
+tick from the skin's law over the taxels (`follow_skin`), and the solver's force is that of the skin. For this a
+fingertip is a row of spheres (`split_pads`). A sphere has exactly one contact point with a primitive, on every engine,
+at a depth in closed form; a capsule has one or two points on a box.
 """
 
 import dataclasses
@@ -179,7 +179,7 @@ def follow_skin(
 
     Args:
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
-      skin_force: [F] N, S: what all skin that bears load (`dexsim.touch.surface.skin_surface`) presses with there.
+      skin_force: [F] N, S: what the skin presses with there (`dexsim.touch.skin`).
       pad_thickness_delta: [] m, change of the rubber's thickness from `pads`.
     """
     shape, radius = object.shape(), jnp.asarray(pads.radius)

@@ -159,43 +159,26 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
 
 
 def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
-    """Raise AssetError naming every feature of a hand that our scene drops or MJX silently ignores, and the elements
-    that have it: a policy trained on such a model would be for a hand that does not exist."""
-    elements = {
-        "actuator": {
-            "actuator delay": np.c_[model.actuator_delay, model.actuator_history[:, 0]],
-            "actuator armature": model.actuator_armature,
-            "actuator damping": np.c_[model.actuator_damping, model.actuator_dampingpoly],
-            "dcmotor actuator": model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR,
-            "pid actuator": model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID,
-        },
-        "sensor": {
-            "sensor delay or interval": np.c_[model.sensor_delay, model.sensor_history[:, 0], model.sensor_interval],
-            "tactile sensor": model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE,
-        },
-        "joint": {
-            "polynomial joint stiffness": model.jnt_stiffnesspoly,
-            "polynomial joint damping": model.dof_dampingpoly[model.jnt_dofadr],
-        },
-    }
-    features = []
-    for kind, values in elements.items():
-        for feature, value in values.items():
-            rows = np.flatnonzero(np.any(np.c_[value] != 0, axis=1))
-            names = [getattr(model, kind)(int(row)).name or f"#{row}" for row in rows]
-            if names:
-                features.append(f"{feature} ({kind} {', '.join(names)})")
-    option = model.opt
+    """Raise AssetError naming every feature of a hand that our scene drops or MJX silently ignores: a policy trained on
+    such a model would be for a hand that does not exist."""
+    option, motors = model.opt, np.isin(model.actuator_dyntype, (mujoco.mjtDyn.mjDYN_DCMOTOR, mujoco.mjtDyn.mjDYN_PID))
     off = [f for f in _FLAGS if option.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
-    whole = {
+    features = {
+        "actuator delay": np.c_[model.actuator_delay, model.actuator_history[:, 0]],
+        "actuator armature": model.actuator_armature,
+        "actuator damping": np.c_[model.actuator_damping, model.actuator_dampingpoly],
+        "dcmotor or pid actuators": motors,
+        "sensor delay or interval": np.c_[model.sensor_delay, model.sensor_history[:, 0], model.sensor_interval],
+        "tactile sensors": model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE,
+        "polynomial joint stiffness": model.jnt_stiffnesspoly,
+        "polynomial joint damping": model.dof_dampingpoly,
         "plugins": model.nplugin,
         "flex bodies": model.nflex,
-        "SDF geoms": np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_SDF),
-        "fluid forces (density, viscosity, wind)": option.density or option.viscosity or np.any(option.wind),
+        "SDF geoms": model.geom_type == mujoco.mjtGeom.mjGEOM_SDF,
+        "fluid forces (density, viscosity, wind)": np.append(option.wind, (option.density, option.viscosity)),
         "noslip iterations": option.noslip_iterations,
         f"flags that disable {', '.join(off)}": off,
         "flag override": option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE,
     }
-    features += [feature for feature, there in whole.items() if there]
-    if features:
-        raise AssetError(f"{where}: cannot simulate: {'; '.join(features)}")
+    if there := [name for name, values in features.items() if np.any(values)]:
+        raise AssetError(f"{where}: cannot simulate: {'; '.join(there)}")

@@ -1,17 +1,19 @@
-"""The picture of a posed hand, its taxels and the object: shading on top of `dexsim.render.raycast`."""
+"""The picture of a posed hand, its taxels and the object, by MuJoCo's ray caster: no OpenGL, no display, and the same
+picture on every machine."""
 
-import dataclasses
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim.render.camera import Camera, CameraView, look, unit
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, linear
 from dexsim.render.panel import force_color
-from dexsim.render.raycast import Camera, CameraView, Primitives, VisibleSurface, cast, hit_points, look, normals
 
 _SUPERSAMPLE = 2  # rays a pixel, in each direction
+_FAR = 1e6  # m, the depth of a ray that hits nothing
 _TAXEL_LIFT = 0.001  # m; the pads follow the taxel lattice to within 1 mm, and no taxel may drown in its pad
 _TAXEL_RADIUS = 0.0007  # m; twice that under full load, up to touching its neighbours
 _OBJECT_OPACITY = 0.62  # so that fingers behind the object stay visible
@@ -19,9 +21,9 @@ _TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
 _GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m to the right and up of the middle
 
 # Linear RGB.
-_SIDES = np.array([linear(color) for color in FACES], np.float32)
+_SIDES = np.array([linear(color) for color in FACES])
 _IDLE_TAXEL = (0.08, 0.09, 0.1)
-_SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]], np.float32)
+_SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]])
 _BACKDROP = np.array([[0.040, 0.047, 0.060], [0.012, 0.014, 0.019]])  # middle, corners
 
 
@@ -32,6 +34,25 @@ class Pose(NamedTuple):
     body_rotation: np.ndarray  # [B, 3, 3]
     taxel_position: np.ndarray  # [F, N, 3] m
     taxel_normal: np.ndarray  # [F, N, 3]
+
+
+class Primitives(NamedTuple):
+    """G posed primitives in the palm frame; sizes are MuJoCo's."""
+
+    kind: tuple[str, ...]  # G
+    size: np.ndarray  # [G, 3], m
+    position: np.ndarray  # [G, 3], m
+    rotation: np.ndarray  # [G, 3, 3]
+    color: np.ndarray  # [G, 3], linear RGB
+    sides: bool = False  # whether sides +x, -x, +y, -y, +z, -z have the colours of `FACES` instead
+
+
+class Surface(NamedTuple):
+    """What each ray of a view sees first. Depth runs along the optical axis."""
+
+    depth: np.ndarray  # [H, W] m, 1e6 where empty
+    index: np.ndarray  # [H, W] int, primitive, -1 where empty
+    normal: np.ndarray  # [H, W, 3] unit, outward
 
 
 def draw_scene(
@@ -45,23 +66,22 @@ def draw_scene(
 ) -> np.ndarray:
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
     view = look(camera, size, _SUPERSAMPLE)
+    rays = view.rays()
     color = _backdrop(view.size).copy()
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
-    taxels, loaded = taxel_primitives(pose, frame.taxel_force, force_range, view.origin)
-    goal = goal_primitives(held, frame, camera)
 
-    surface = cast(body, view)
-    _paint(color, body, surface, view, camera)
-    skin = _in_front(cast(taxels, view), surface.depth)
-    _paint(color, taxels, skin, view, camera)
-    front = _in_front(cast(held, view), surface.depth)
-    _paint(color, held, front, view, camera, _OBJECT_OPACITY)
+    links = cast(body, view, rays)
+    _paint(color, body, links, links.index >= 0, rays, view, camera)
+    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view)
+    front = cast(held, view, rays)
+    _paint(color, held, front, front.depth < links.depth, rays, view, camera, _OBJECT_OPACITY)
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
-    hidden = (front.index >= 0) & (skin.index >= 0) & np.append(loaded, False)[skin.index]
-    behind = dataclasses.replace(skin, index=np.where(hidden, skin.index, -1))
-    _paint(color, taxels, behind, view, camera, _TAXEL_GLOW)
-    marker = _in_front(cast(goal, view), np.minimum(surface.depth, front.depth))
-    _paint(color, goal, marker, view, camera, _GOAL_OPACITY)
+    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view, _TAXEL_GLOW)
+    if frame.goal_rotation is not None:
+        goal = goal_primitives(held, frame, camera)
+        marker = cast(goal, view, rays)
+        nearest = np.minimum(links.depth, front.depth)
+        _paint(color, goal, marker, marker.depth < nearest, rays, view, camera, _GOAL_OPACITY)
     return _develop(color)
 
 
@@ -77,23 +97,8 @@ def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
         np.array([geom.size for geom in geoms]),
         pose.body_position[body] + position,
         turn @ np.array([geom.rotation for geom in geoms]),
-        np.array([linear(tone) for tone in tones], np.float32),
+        np.array([linear(tone) for tone in tones]),
     )
-
-
-def taxel_primitives(
-    pose: Pose, force: np.ndarray, force_range: float, eye: np.ndarray
-) -> tuple[Primitives, np.ndarray]:
-    """The taxels that face the eye as beads on the skin in the colour of their force, and which are loaded."""
-    visible = np.sum(pose.taxel_normal * (eye - pose.taxel_position), -1) > 0
-    level = force[visible]
-    count, loaded = len(level), level > 0
-    size = np.zeros((count, 3))
-    size[:, 0] = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1))
-    hot = (force_color(level, force_range) / 255) ** 2.2
-    position = pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible]
-    color = np.where(loaded[:, None], hot, _IDLE_TAXEL).astype(np.float32)
-    return Primitives(("sphere",) * count, size, position, np.tile(np.eye(3), (count, 1, 1)), color), loaded
 
 
 def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
@@ -105,8 +110,8 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
         frame.primitive_size[active],
         frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T,
         frame.object_rotation @ frame.primitive_rotation[active],
-        np.tile(np.array(linear(OBJECT), np.float32), (len(active), 1)),
-        _SIDES if kind == ("box",) else None,
+        np.tile(linear(OBJECT), (len(active), 1)),
+        kind == ("box",),
     )
 
 
@@ -116,69 +121,89 @@ def goal_position(camera: Camera) -> np.ndarray:
 
 
 def goal_primitives(held: Primitives, frame: Any, camera: Camera) -> Primitives:
-    """The object again, smaller and in its goal orientation; nothing for a task without one."""
-    if frame.goal_rotation is None:
-        return Primitives((), *(part[:0] for part in held[1:5]))
+    """The object again, smaller and in its goal orientation."""
     turn = frame.goal_rotation @ frame.object_rotation.T
     position = goal_position(camera) + _GOAL_SCALE * (held.position - frame.object_position) @ turn.T
     return held._replace(size=_GOAL_SCALE * held.size, position=position, rotation=turn @ held.rotation)
 
 
-def _in_front(surface: VisibleSurface, depth: np.ndarray) -> VisibleSurface:
-    """What of a surface is nearer than `depth` [H, W]."""
-    return dataclasses.replace(surface, index=np.where(surface.depth < depth, surface.index, -1))
+def cast(primitives: Primitives, view: CameraView, rays: np.ndarray) -> Surface:
+    """The nearest primitive along every one of a view's `rays` [H, W, 3]."""
+    spec, count = mujoco.MjSpec(), rays.shape[0] * rays.shape[1]
+    quat = np.empty(4)
+    for kind, size, position, rotation in zip(*primitives[:4], strict=True):
+        mujoco.mju_mat2Quat(quat, np.asarray(rotation, float).ravel())
+        shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+        spec.worldbody.add_geom(type=shape, size=np.maximum(size, 1e-6), pos=position, quat=quat)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    index, distance, normal = np.full(count, -1, np.int32), np.empty(count), np.empty(3 * count)
+    origin = np.asarray(view.origin, float)
+    mujoco.mj_multiRay(model, data, origin, rays.ravel(), None, True, -1, index, distance, normal, count, _FAR)
+    index, depth = index.reshape(rays.shape[:2]), distance.reshape(rays.shape[:2])
+    return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
 
 
 def _paint(
     color: np.ndarray,
     primitives: Primitives,
-    surface: VisibleSurface,
+    surface: Surface,
+    seen: np.ndarray,
+    rays: np.ndarray,
     view: CameraView,
     camera: Camera,
     opacity: float = 1.0,
 ) -> None:
-    """Shade a surface by sky, ground and one warm key light, and lay it over the picture, linear RGB [H, W, 3]."""
-    rows, columns = (np.flatnonzero((surface.index >= 0).any(axis)) for axis in (1, 0))
-    if not len(rows):
-        return
-    n = _SUPERSAMPLE
-    top, left = rows[0] // n * n, columns[0] // n * n
-    window = slice(top, rows[-1] // n * n + n), slice(left, columns[-1] // n * n + n)
-    index, color = surface.index[window], color[window]
-    # A pixel within one primitive is shaded once, one at an edge in each of its rays.
-    inside, needed = index[::n, ::n] >= 0, index >= 0
-    others = [(i, j) for i in range(n) for j in range(n) if i + j > 0]
-    for i, j in others:
-        inside &= index[i::n, j::n] == index[::n, ::n]
-    for i, j in others:
-        needed[i::n, j::n] &= ~inside
-    row, column = np.nonzero(needed)
-    index, depth = index[row, column], surface.depth[window][row, column]
-    points = hit_points(view, row + top, column + left, depth)
-    normal = normals(primitives, index, points)
-    up = _unit(np.asarray(camera.up, float))
-    light = _unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])  # over the camera's right shoulder
-    up, light, toward = up.astype(np.float32), light.astype(np.float32), view.origin.astype(np.float32) - points
-    facing = np.einsum("mi,mi->m", normal, toward) / np.sqrt(np.einsum("mi,mi->m", toward, toward))
-    away = (1 - np.clip(facing, 0, 1))[:, None]
+    """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the picture,
+    linear RGB [H, W, 3]."""
+    index, normal = surface.index[seen], surface.normal[seen]
+    up = unit(np.asarray(camera.up, float))
+    light = unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])  # over the camera's right shoulder
+    away = (1 - np.clip(-np.sum(normal * unit(rays[seen]), -1), 0, 1))[:, None]
     shade = _GROUND + (0.5 + 0.5 * normal @ up)[:, None] * (_SKY - _GROUND)
     shade += np.maximum(normal @ light, 0)[:, None] * _KEY
-    shade *= face_colors(primitives, index, normal)
-    shade += np.float32(0.1) * away**3  # a rim of light
+    shade *= _face_colors(primitives, normal) if primitives.sides else primitives.color[index]
+    shade += 0.1 * away**3  # a rim of light
     # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
-    weight = opacity + (1 - opacity) * away**2
-    color[row, column] += weight * (shade - color[row, column])
-    for i, j in others:
-        color[i::n, j::n][inside] = color[::n, ::n][inside]
+    color[seen] += (opacity + (1 - opacity) * away**2) * (shade - color[seen])
 
 
-def face_colors(primitives: Primitives, index: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The colour [M, 3] of each point: its primitive's, or that of the side of a box that its normal is nearest to."""
-    if primitives.sides is None:
-        return primitives.color[index]
-    local = normal @ primitives.rotation[0].astype(np.float32)
+def _face_colors(box: Primitives, normal: np.ndarray) -> np.ndarray:
+    """The colour [M, 3] of the side of a box that each `normal` [M, 3] is of."""
+    local = normal @ box.rotation[0]
     axis = np.abs(local).argmax(-1)
-    return primitives.sides[2 * axis + (local[np.arange(len(axis)), axis] < 0)]
+    return _SIDES[2 * axis + (local[np.arange(len(axis)), axis] < 0)]
+
+
+def _paint_taxels(
+    color: np.ndarray,
+    pose: Pose,
+    force: np.ndarray,
+    force_range: float,
+    depth: np.ndarray,
+    view: CameraView,
+    glow: float | None = None,
+) -> None:
+    """The taxels that face the camera and that no link hides, as discs in the colour of their force [F, N] N; with
+    `glow` the loaded ones alone, laid over the picture with that weight. `depth` [H, W] m is that of the links."""
+    visible = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1) > 0
+    if glow is not None:
+        visible &= force > 0
+    level = force[visible]
+    hot = (force_color(level, force_range) / 255) ** 2.2
+    tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
+    pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
+    radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
+    width, height = view.size
+    for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
+        left, right = max(int(x - r), 0), min(int(x + r) + 2, width)
+        top, bottom = max(int(y - r), 0), min(int(y + r) + 2, height)
+        rows, columns = np.ogrid[top:bottom, left:right]
+        disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
+        disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT
+        part = color[top:bottom, left:right]
+        part[disc] += (1.0 if glow is None else glow) * (hue - part[disc])
 
 
 @lru_cache(maxsize=4)
@@ -187,17 +212,12 @@ def _backdrop(size: tuple[int, int]) -> np.ndarray:
     width, height = size
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     edge = np.clip((x**2 + y**2) / 1.6, 0, 1)[..., None]
-    return (_BACKDROP[0] + (_BACKDROP[1] - _BACKDROP[0]) * edge).astype(np.float32)
+    return _BACKDROP[0] + (_BACKDROP[1] - _BACKDROP[0]) * edge
 
 
 def _develop(color: np.ndarray) -> np.ndarray:
     """Linear light of all rays [H, W, 3] as sRGB bytes of pixels."""
     height, width, _ = color.shape
     n = _SUPERSAMPLE
-    rays = color.reshape(height // n, n, width // n, n, 3)
-    light = np.add.reduce([rays[:, i, :, j] for i in range(n) for j in range(n)]) / (n * n)
+    light = color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
     return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)

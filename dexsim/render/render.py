@@ -19,9 +19,9 @@ from dexsim.core.files import write_atomic
 from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
+from dexsim.render.camera import Camera
 from dexsim.render.panel import draw_panel, make_layout, read_outs, taxel_image
 from dexsim.render.picture import Pose, draw_scene
-from dexsim.render.raycast import Camera
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {

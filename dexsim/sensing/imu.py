@@ -9,7 +9,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import uniforms
 from dexsim.geometry import rotations
@@ -27,12 +27,8 @@ class ImuConfig(Config):
     """Largest drift of the heading about the vertical."""
     rate: float = setting(100.0, unit="Hz", low=1.0, high=10000.0)
     """Samples per second; between two samples the last one is read again."""
-    delay: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    delay: Range = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
     """Age of a sample. At most one control tick is modelled."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "delay")
 
 
 @pytree_dataclass

@@ -19,10 +19,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.pytree import pytree_dataclass
 
-Range = tuple[float, float]
 DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 """Effects that are drawn at every episode start where they have a range."""
 
@@ -59,10 +58,6 @@ class TaxelSensor(Config):
     rate: Range | None = setting(None, unit="Hz", low=0.1, high=1e4)
     """The array's own sampling rate, below the control rate; between samples the last reading is repeated. None: it
     samples at the control rate."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "hysteresis_time", *(name for name in DRAWN if getattr(self, name) is not None))
 
 
 @pytree_dataclass

@@ -8,10 +8,8 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 
 
@@ -19,9 +17,6 @@ from dexsim.hand.kinematics import Hand
 class ForceEstimate(Config):
     """How taxels and torque make an estimate."""
 
-    per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
-    """Force of each finger with its root joint at the torque limit; empty: by the hand's own `force_per_torque`, and of
-    a hand without it the taxels alone."""
     torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
     """Share of the torque's force beyond the taxels' that counts: 0 for the taxels alone, 1 for the larger of both."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
@@ -30,18 +25,9 @@ class ForceEstimate(Config):
 
 def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, joint_torque: jax.Array) -> jax.Array:
     """Estimated force [F] N of each finger: the sum of its `taxel_force` [F, N] N and a share of what its
-    `joint_torque` [J], over the torque limits, tells beyond it; 0 without touch.
-
-    Raises:
-      ConfigError: `per_torque` is of a hand with another number of fingers.
+    `joint_torque` [J], over the torque limits, tells beyond it by the hand's `force_per_torque`; 0 without touch.
     """
     taxels = jnp.sum(taxel_force, -1)
     gain = hand.force_per_torque * hand.torque_limit[hand.root_joint]
-    if estimate.per_torque:
-        if len(estimate.per_torque) != hand.num_fingers:
-            raise ConfigError(
-                f"ForceEstimate.per_torque has {len(estimate.per_torque)} values, the hand {hand.num_fingers} fingers"
-            )
-        gain = np.asarray(estimate.per_torque, np.float32)
     beyond = jnp.maximum(gain * jnp.abs(joint_torque[hand.root_joint]) - taxels, 0.0)
     return jnp.where(taxels > estimate.touching, taxels + estimate.torque_share * beyond, 0.0)

@@ -42,10 +42,6 @@ class Skin(Config):
     total: str = setting("pressing", choices=TOTALS)
     """Which part of the physics' contact force a finger's taxels share: what presses into the skin, which is all
     that a one-axis taxel feels (pressing), or the magnitude with friction (solver), as in the paper."""
-    untaxelled: bool = False
-    """True: the fingertips' skin beyond the taxels bears its share of a finger's total, which no taxel reads, and of
-    the contact's stiffness (`dexsim.touch.surface`). False: the skin ends with the taxels, which share all of it, as
-    in the paper; beyond them fingertips are as soft as `contact.SOFTEST` lets them be."""
 
     def __post_init__(self):
         super().__post_init__()

@@ -17,7 +17,6 @@ from dexsim.geometry import rotations
 from dexsim.geometry.distance import signed_distance
 from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.touch.skin import Skin, skin_stress
-from dexsim.touch.surface import Surface, taxels_only
 
 
 @pytree_dataclass
@@ -37,10 +36,9 @@ def compute_touch(
     rotation: jax.Array,
     finger_force: jax.Array,
     skin: Skin,
-    surface: Surface | None = None,
     pad_thickness_delta: jax.Array | float = 0.0,
 ) -> Touch:
-    """What the taxels of a posed hand feel, or other points of its fingertips' skin.
+    """What the taxels of a posed hand feel.
 
     A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
     that has no taxels.
@@ -49,20 +47,18 @@ def compute_touch(
       geometry, position [3], rotation [3, 3]: the object, prepared for any method of `dexsim.geometry.distance` (a
         `sdf.Shape` is as it is), and its pose in the palm frame.
       finger_force: [F] N, resultant fingertip-object force of the physics.
-      surface: other points than the taxels.
       pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
     """
-    surface = surface or taxels_only(hand)
     # From the links' frames directly to the object's: one transform a finger instead of two a taxel.
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
     shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position[None])
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
-    taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
+    taxel = [jnp.asarray(hand.taxel_position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
     margin = jnp.maximum(skin.margin + pad_thickness_delta, 0.0)
     depth = jnp.maximum(margin - signed_distance(jnp.stack(local, -1), geometry), 0.0)
-    skin_force = skin_stress(depth / skin.thickness, skin) * jnp.asarray(surface.area)
+    skin_force = skin_stress(depth / skin.thickness, skin) * jnp.asarray(hand.taxel_area)
     return Touch(depth, skin_force, spread(skin_force, finger_force))
 
 

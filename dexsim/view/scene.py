@@ -10,10 +10,10 @@ import numpy as np
 import trimesh
 
 from dexsim.hand.kinematics import Hand
+from dexsim.render.camera import look
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
 from dexsim.render.picture import Pose
-from dexsim.render.raycast import look
 from dexsim.render.render import CAMERAS, hand_poses
 from dexsim.view.source import Frame
 

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 
@@ -66,12 +66,8 @@ class LinkConfig(Config):
     paced: bool = setting(True)
     """Reject answers that arrive sooner than the baud rate allows: they belong to an earlier request. Turn this off for
     an emulated line without timing."""
-    backoff: tuple[float, float] = setting((0.1, 0.5), unit="s", low=0.001, high=600.0)
+    backoff: Range = setting((0.1, 0.5), unit="s", low=0.001, high=600.0)
     """First and longest wait between attempts to reconnect; it doubles at each attempt."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "backoff")
 
     def deadline(self, request: int, reply: int) -> float:
         """Timeout in s for `reply` bytes after sending `request` bytes."""

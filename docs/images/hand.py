@@ -15,9 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 import dexsim
 from dexsim.force_loop import commanded_force
 from dexsim.hand.kinematics import Hand
+from dexsim.render.camera import look
 from dexsim.render.panel import ACCENT, EMPTY, FAINT, INK, PANEL, force_color, taxel_image
 from dexsim.render.picture import draw_scene, goal_position
-from dexsim.render.raycast import look, project
 from dexsim.render.render import CAMERAS, hand_poses
 from dexsim.render.snapshot import Snapshot
 from dexsim_ppo import load_policy
@@ -72,7 +72,7 @@ def half(hand: Hand, task: str, shots: Snapshot) -> list[Image.Image]:
             chart(draw, shots.target_force, measured, t)
         else:
             title = [("Quarter turns ", FAINT), (f"{int(shot.turns)}", ACCENT)]
-            at = project(look(view, (WIDTH, SCENE)), goal_position(view))[0]
+            at = look(view, (WIDTH, SCENE)).project(goal_position(view))[0]
             draw.text((at[0], HEADER + at[1] + 44), "goal", fill=INK, font=LABEL, anchor="mm")
         x = 18.0
         for text, color in title:

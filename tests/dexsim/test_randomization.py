@@ -1,18 +1,16 @@
 """What is drawn at every episode start: ranges, the nominal hand, curriculum, held-out hands."""
 
-import copy
 import dataclasses
 import functools
 
 import jax
 import numpy as np
 import pytest
-from episodes import with_episode
+from ranges import draw_alone, range_paths
 
 from dexsim.core.errors import ConfigError
+from dexsim.objects.config import SIZE_RANGES
 from dexsim.randomization import Randomization, sample_hand
-from dexsim.randomization_check.__main__ import conclude
-from dexsim.randomization_check.effects import check
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
@@ -190,70 +188,56 @@ def test_refusals(values, word):
         Randomization(**values)
 
 
-# --- the self-test -----------------------------------------------------------------------------------
+# --- what each range reaches --------------------------------------------------------------------------
 
-# What each range must reach, by the names of the drive's parameters and of the compiled model's fields.
-REACHES = {
-    "stiffness_factor": "hand.actuator.stiffness",
-    "damping_factor": "hand.actuator.damping",
-    "dead_band": "hand.actuator.dead_band",
-    "torque_factor": "hand.actuator.stall_torque",
-    "speed_factor": "hand.actuator.no_load_speed",
-    "efficiency": "hand.actuator.efficiency",
-    "latency": "hand.latency",
-    "latency_spread": "hand.latency",
-    "ripple": "hand.actuator.ripple",
-    "ripple_count": "hand.actuator.ripple_count",
-    "coulomb_friction": "hand.actuator.coulomb_friction",
-    "viscous_friction": "hand.actuator.viscous_friction",
-    "sensing_latency": "hand.sensing_latency",
-    "encoder_bias": "hand.actuator.encoder_bias",
-    "torque_gain": "hand.torque_gain",
-    "taxel_gain": "hand.taxel_gain",
-    "gravity_tilt": "hand.tilt",
-    "pad_thickness_delta": "hand.pad_thickness_delta",
-    "mass": "body_mass",
-    "inertia_scale": "body_inertia",
-    "com_offset": "body_ipos",
-    "friction": "pair_friction",
-    "link_friction": "pair_friction",
-    "sphere_radius": "geom_size",
-    "box_half": "geom_size",
+# By the names of the drive's parameters and of the compiled model's fields.
+RANGES = {
+    "randomization.stiffness_factor": "hand.actuator.stiffness",
+    "randomization.damping_factor": "hand.actuator.damping",
+    "randomization.dead_band": "hand.actuator.dead_band",
+    "randomization.torque_factor": "hand.actuator.stall_torque",
+    "randomization.speed_factor": "hand.actuator.no_load_speed",
+    "randomization.efficiency": "hand.actuator.efficiency",
+    "randomization.latency": "hand.latency",
+    "randomization.latency_spread": "hand.latency",
+    "randomization.ripple": "hand.actuator.ripple",
+    "randomization.ripple_count": "hand.actuator.ripple_count",
+    "randomization.coulomb_friction": "hand.actuator.coulomb_friction",
+    "randomization.viscous_friction": "hand.actuator.viscous_friction",
+    "randomization.sensing_latency": "hand.sensing_latency",
+    "randomization.encoder_bias": "hand.actuator.encoder_bias",
+    "randomization.torque_gain": "hand.torque_gain",
+    "randomization.taxel_gain": "hand.taxel_gain",
+    "randomization.gravity_tilt": "hand.tilt",
+    "randomization.pad_thickness_delta": "hand.pad_thickness_delta",
+    "sensing.orientation.bias": "imu.bias",
+    "sensing.orientation.drift": "imu.drift",
+    "sensing.orientation.delay": "imu.delay",
+    **{f"objects.{name}": "geom_size" for name in SIZE_RANGES},
+    "objects.mass": "body_mass",
+    "objects.inertia_scale": "body_inertia",
+    "objects.com_offset": "body_ipos",
+    "objects.friction": "pair_friction",
+    "objects.link_friction": "pair_friction",
+    "objects.stiffness": "pair_solref",
+    "objects.restitution": "pair_solref",
 }
-SENSED = ("sensing_latency", "torque_gain", "taxel_gain")  # in the readings, without effect on the motion
+# In the readings, without effect on the motion.
+SENSED = {
+    "randomization.sensing_latency": "joint_position",
+    "randomization.torque_gain": "joint_torque",
+    "randomization.taxel_gain": "taxel_force",
+    "sensing.orientation.bias": "palm_gravity",
+    "sensing.orientation.drift": "object_quat",
+    "sensing.orientation.delay": "object_quat",
+}
 
 
-@pytest.fixture(scope="module")
-def fresh(grasp_rollout):
-    return grasp_rollout.reset(jax.random.key(21))
-
-
-def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, fresh):
-    effects = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=9)
-    by_name = {effect.name.split(".")[-1]: effect for effect in effects}
-    assert len(by_name) == len(effects) >= 30 and conclude(effects) == 0
-    for name, leaf in REACHES.items():
-        effect = by_name[name]
-        assert leaf in effect.changed and not effect.off, name
-        if name in SENSED:
-            assert effect.joint == effect.object == 0 and effect.reading > 1e-3, name
-        else:
-            assert max(effect.joint, effect.object) > 1e-6, name
-
-
-def test_a_lost_range_fails_the_check(grasp_env, grasp_rollout, fresh, capsys):
-    """Viscous friction is lost between draw and physics; a ripple without width is off, and no error."""
-
-    def ignores_friction(states, action):
-        drawn = states.episode.hand
-        calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
-        return grasp_rollout.step(with_episode(states, hand=dataclasses.replace(drawn, actuator=calm)), action)
-
-    env = copy.copy(grasp_env)
-    env.config = dataclasses.replace(env.config, randomization=Randomization(ripple=(0.0, 0.0)))
-    names = [f"randomization.{name}" for name in ("viscous_friction", "speed_factor", "ripple")]
-    lost, works, off = check(env, ignores_friction, fresh, key=jax.random.key(0), ticks=6, names=names)
-    assert not lost.works and lost.changed == ("hand.actuator.viscous_friction",)
-    assert works.works and not works.off and off.off and off.works
-    assert conclude([lost, works, off]) == 2
-    assert "no effect on model or motion: randomization.viscous_friction\n" in capsys.readouterr().err
+def test_every_range_reaches_the_model_and_then_motion_or_readings(grasp_env, grasp_rollout):
+    states = grasp_rollout.reset(jax.random.key(21))
+    assert set(range_paths(grasp_env)) == set(RANGES)
+    for path, leaf in RANGES.items():
+        changed, moved = draw_alone(grasp_env, grasp_rollout.step, states, path, ticks=9)
+        assert leaf in changed, path
+        assert moved[SENSED.get(path, "motion")] > 1e-6, path
+        assert (moved["motion"] == 0) == (path in SENSED), path

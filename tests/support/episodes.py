@@ -10,7 +10,6 @@ from dexsim.env.task import GroundTruth
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
-from dexsim.touch.surface import skin_surface
 from dexsim.touch.taxel_force import Touch, compute_touch
 
 
@@ -66,8 +65,6 @@ def tip_stiffness(physics, skin, object, qpos):
     hand, place = physics.hand, qpos[physics.object_qpos]
     pose = forward_kinematics(hand, qpos[physics.joint_qpos])
     turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-    with jax.ensure_compile_time_eval():  # points of the skin, also where the caller is traced
-        surface = skin_surface(hand, skin)
     unit = jnp.ones(hand.num_fingers)
-    pressed = compute_touch(hand, pose, object.shape(), place[:3], turn, unit, skin, surface).skin_force.sum(-1)
+    pressed = compute_touch(hand, pose, object.shape(), place[:3], turn, unit, skin).skin_force.sum(-1)
     return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

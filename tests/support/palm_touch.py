@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.hand.kinematics import HandPose
-from dexsim.touch.surface import Surface
 from dexsim.touch.taxel_force import compute_touch
 
 
@@ -14,6 +13,6 @@ def feel(taxels, area, geometry, position, rotation, finger_force, skin, pad_thi
     """`compute_touch` for taxels [F, N, 3] m of `area` [F, N] m^2."""
     fingers = len(taxels)
     place, turn = jnp.zeros((fingers, 3)), jnp.tile(jnp.eye(3), (fingers, 1, 1))
-    hand, pose = SimpleNamespace(tip_body=np.arange(fingers)), HandPose(place, turn, place, turn)
-    surface = Surface(taxels, taxels, area)
-    return compute_touch(hand, pose, geometry, position, rotation, finger_force, skin, surface, pad_thickness_delta)
+    hand = SimpleNamespace(tip_body=np.arange(fingers), taxel_position=taxels, taxel_area=area)
+    pose = HandPose(place, turn, place, turn)
+    return compute_touch(hand, pose, geometry, position, rotation, finger_force, skin, pad_thickness_delta)

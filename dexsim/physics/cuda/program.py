@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError
-from dexsim.core.files import make_private, read_private, write_atomic
+from dexsim.core.files import write_atomic
 from dexsim.core.install import install_line
 from dexsim.physics.cuda.law import PrintedLaw
 from dexsim.physics.cuda.scene import buffers, declare_args, kernel_constants
@@ -71,12 +71,10 @@ def compile_kernel(text: str, architecture: str) -> bytes:
     options = (*OPTIONS, f"--gpu-architecture={architecture}")
     digest = hashlib.sha256(repr((text, sorted(headers().items()), options, compiler.version)).encode())
     path = cache_path("cuda") / f"{digest.hexdigest()}.cubin"
-    with contextlib.suppress(OSError):
-        make_private(path.parent)
-        return read_private(path)
+    if path.exists():
+        return path.read_bytes()
     code = compiler.compile(text, headers(), options)
     with contextlib.suppress(OSError):  # a disk without room or rights
-        make_private(path.parent)
         write_atomic(path, [code])
     return code
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from dexsim.control import Control
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.env.config import EnvConfig
 from dexsim.force_loop import ForceLoop
 from dexsim.touch.skin import Skin
@@ -52,7 +52,7 @@ class GraspConfig(EnvConfig):
     """Training episode length. Short episodes practise the catch, in which most of the lost objects are lost."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
     """Evaluation episode length; the object must be held this long. Force is scored from 3 s on."""
-    finger_force: tuple[float, float] = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
+    finger_force: Range = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
     """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose with four fingers."""
     max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
     """Force that forces are normalised by."""
@@ -64,18 +64,14 @@ class GraspConfig(EnvConfig):
     """The object is lost when its centre is farther than this from the grasp centre."""
     posture: tuple[float, ...] = setting((), unit="rad", low=-3.2, high=3.2)
     """Joint angles that episodes start near; empty for those that the hand's TOML gives."""
-    curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
+    curl: Range = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
     """Range added to all joints of the four fingers alike: how far closed they start."""
-    release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
+    release_gap: Range = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Range of the gap between palm and object at release."""
-    release_delay: tuple[float, float] = setting((0.1, 0.5), unit="s", low=0.0, high=2.0)
+    release_delay: Range = setting((0.1, 0.5), unit="s", low=0.0, high=2.0)
     """Range of the time for which somebody still holds the object after the fingers have begun to move."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "finger_force", "curl", "release_gap", "release_delay")
 
 
 def paper() -> GraspConfig:

@@ -56,7 +56,6 @@ def summarize(
     # Of each episode [N], the mean over its late ticks.
     late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*_COMMANDED, *_MEANS)}
     commanded = {part: late_means[f"finger_{part}"] for part in FORCES.values()}
-    touching = alive & (metrics["total_force"] > 0.01)
 
     def command_row(level: float) -> dict:
         mine = command == level
@@ -80,9 +79,6 @@ def summarize(
             "force_error_n": force_error(commanded["force"][mine], target[mine]),
         }
 
-    by_command = [command_row(level) for level in np.unique(command)]
-    means = [row["total_force_n"]["mean"] for row in by_command]
-    complete = all(m is not None for m in means)
     report = {
         "episodes": episodes,
         "seconds": ticks * control_period,
@@ -95,15 +91,9 @@ def summarize(
         "slope_torque": slope(command[held], late_means["total_torque"][held]),
         "force_error_n": force_error(commanded["force"], target),
         "torque_limited": mean(late_means["torque_limited"][held]),
-        "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
-        "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
-        "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
-        "total_force_by_command_n": means,
-        # Both are of the taxels: skin beyond them may bear load as well.
-        "skin_correlation": pearson(metrics["skin_force"][touching], metrics["taxel_force"][touching], samples=0),
         "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
         "non_finite": int(metrics["non_finite"].sum()),
-        "by_command": by_command,
+        "by_command": [command_row(level) for level in np.unique(command)],
         "by_shape": [shape_row(index) for index in np.unique(shape)],
     }
     return report | {"headline": _headline(report)}
@@ -121,7 +111,6 @@ def _headline(report: dict) -> dict:
         "r, force on the taxels": entry(report["r_taxels"]),
         "r, force on the taxels, worst shape": min((r for r in by_shape if r is not None), default=None),
         "ticks with a joint at its torque limit": entry(report["torque_limited"]),
-        "force range": report["force_range"],
     }
 
 
@@ -163,5 +152,5 @@ def slope(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
 def _interval(name: str, function: Callable, count: int, samples: int, defined: bool) -> dict:
     if not defined:
         return {name: None, "low": None, "high": None}
-    low, high = bootstrap(function, count, samples) if samples else (None, None)
+    low, high = bootstrap(function, count, samples)
     return {name: function(slice(None)), "low": low, "high": high}

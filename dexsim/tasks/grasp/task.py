@@ -270,7 +270,6 @@ class Grasp(Task):
                 jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
             ),
             "taxel_force": jnp.sum(pressing),
-            "skin_force": jnp.sum(truth.touch.skin_force),
             "thumb_force": force[0],
             "touching": jnp.sum(contact).astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from dexsim.control import Control
-from dexsim.core.config import Config, check_ranges, setting
+from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.objects.config import ObjectConfig
@@ -55,7 +55,7 @@ class RotateConfig(EnvConfig):
     than fingertips: with more, random strokes carry the object over the thumb."""
     control: Control = setting(Control(step=0.08, last_action_encoding="target"))
     """From action to joint target."""
-    edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
+    edge: Range = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
     """Range of the edge of the cube that is turned, where `objects` has no mesh."""
     turn: TurnSpec = setting(TurnSpec(spin=2.0))
     """Goals that follow one another about an axis, and when each is reached."""
@@ -93,9 +93,9 @@ class RotateConfig(EnvConfig):
     posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
     """Largest deviation of the start posture from `posture`, per joint. It is wide, so that a stroke can begin where
     another ended."""
-    curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
+    curl: Range = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
     """Range added to all joints of the four fingers alike."""
-    squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
+    squeeze: Range = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
     """Range of the distance between joint targets and start posture of thumb and fingers: the grip."""
     start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
     """Start position of the object, across and along the palm (y, z) from the reference: a little away from thumb and
@@ -110,7 +110,6 @@ class RotateConfig(EnvConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self, "edge", "curl", "squeeze")
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
 

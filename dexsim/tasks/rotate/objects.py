@@ -32,13 +32,9 @@ def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
         return sample_object(key, config.objects)
     edge_key, base_key, scale_key = jax.random.split(key, 3)
     base = sample_object(base_key, config.objects, jnp.int32(SHAPES.index("box")))
-    shortest, longest = config.edge
-    if config.objects.scale != 1:
-        middle, reach = (shortest + longest) / 2, config.objects.scale * (longest - shortest) / 2
-        shortest, longest = middle - reach, middle + reach
     extreme = sample_extreme(base_key, config.objects.extremes)  # the one that `sample_object` draws
-    half = uniform(edge_key, (shortest, longest), extreme) / 2
-    solid = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, extreme)
+    half = uniform(edge_key, config.edge, extreme) / 2
+    solid = base.mass * uniform(scale_key, config.objects.inertia_scale, extreme)
     stand = upright(config.turn.unit_axis)
     return dataclasses.replace(
         base,

@@ -4,13 +4,10 @@ Settling runs in C MuJoCo on the host's cores, once: the pool is kept on disk un
 configuration.
 """
 
-import contextlib
 import functools
 import hashlib
-import io
 import json
 import os
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -19,10 +16,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.core.assets import cache_path
+from dexsim.core.assets import cached_arrays
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
-from dexsim.core.files import write_atomic
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
@@ -54,25 +50,20 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
     Raises:
       ConfigError: next to nothing stays in the hand.
     """
-    path = cache_path("pools") / f"rotate-{_fingerprint(key, hand, config)}.npz"
-    leaves, structure = jax.tree.flatten(jax.eval_shape(lambda: sample_turned_object(key, config)))
-    try:
-        with np.load(path) as file:
-            stored = [file[f"a{i}"] for i in range(len(leaves) + 3)]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # missing, damaged, of another layout
-        stored = _make(key, hand, config, gravity, config.pool_size)
-        trapped = round(config.trap * config.pool_size)
-        if trapped:
+    structure = jax.tree.structure(jax.eval_shape(lambda: sample_turned_object(key, config)))
+
+    def make() -> dict[str, np.ndarray]:
+        pool = _make(key, hand, config, gravity, config.pool_size)
+        if trapped := round(config.trap * config.pool_size):
             few = _make(jax.random.fold_in(key, 1), hand, config, gravity, min(trapped, _TRAPS), trap=True)
-            stored = [
+            pool = [
                 np.concatenate([rows[trapped:], np.resize(more, (trapped, *more.shape[1:]))])
-                for rows, more in zip(stored, few, strict=True)
+                for rows, more in zip(pool, few, strict=True)
             ]
-        buffer = io.BytesIO()
-        np.savez(buffer, **{f"a{i}": rows for i, rows in enumerate(stored)})
-        with contextlib.suppress(OSError):  # a disk without room or rights
-            write_atomic(path, [buffer.getbuffer()])
-    qpos, qvel, joint_target, *rows = stored
+        return {f"{index:02d}": rows for index, rows in enumerate(pool)}
+
+    stored = cached_arrays("pools", _fingerprint(key, hand, config), make)
+    qpos, qvel, joint_target, *rows = [stored[name] for name in sorted(stored)]
     return Start(qpos=qpos, qvel=qvel, object=jax.tree.unflatten(structure, rows), joint_target=joint_target)
 
 
@@ -81,14 +72,12 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     settings = {name: value for name, value in to_dict(config).items() if name not in _UNUSED}
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
     turn = config.turn.axis, config.turn.distance
-    digest = hashlib.sha256(json.dumps([settings, motors, turn], sort_keys=True).encode())
-    digest.update(hand.model_path.read_bytes() + hand.digest.encode())
-    digest.update(np.asarray(jax.random.key_data(key)).tobytes())
-    digest.update(f"{_VERSION} {mujoco.__version__}".encode())
-    if config.objects.mesh:
-        boxes = load_mesh_object(config.objects).boxes
-        digest.update(b"".join(part.tobytes() for part in (boxes.size, boxes.position, boxes.quat)))
-    return digest.hexdigest()[:16]
+    given = [settings, motors, turn, hand.digest, np.asarray(jax.random.key_data(key)).tolist()]
+    boxes = load_mesh_object(config.objects).boxes if config.objects.mesh else None
+    files = hashlib.sha256(hand.model_path.read_bytes())
+    for part in (boxes.size, boxes.position, boxes.quat) if boxes else ():
+        files.update(part.tobytes())
+    return f"{json.dumps(given, sort_keys=True)} {files.hexdigest()} {_VERSION} {mujoco.__version__}"
 
 
 def _make(

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim.core.config import Config, check_ranges, from_dict, override, setting, to_dict
+from dexsim.core.config import Config, Range, from_dict, override, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
 from dexsim.randomization import Randomization
@@ -22,16 +22,12 @@ class Spring(Config):
     stiffness: float = setting(2.0, unit="N/m", low=0.5, high=8.0)
     turns: int = setting(3, low=1)
     rest: float = setting(0.0, unit="m", high=0.1)
-    span: tuple[float, float] = setting((0.0, 1.0), unit="m", low=-1.0, high=2.0)
+    span: Range = setting((0.0, 1.0), unit="m", low=-1.0, high=2.0)
     wire: str = setting("steel", choices=("steel", "brass"))
     marks: tuple[str, ...] = setting((), choices=("red", "blue"))
     name: str | None = setting(None)
     wound: bool = setting(True)
     side: typing.Literal["left", "right"] | None = None
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, "span")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

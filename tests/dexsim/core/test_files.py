@@ -1,14 +1,13 @@
-"""Files: whole or not at all; folders that others may write to are turned away."""
+"""Files: whole or not at all, and none that is read is replaced."""
 
 import os
 from pathlib import Path
 
-import jax
 import pytest
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError, DexsimWarning
-from dexsim.core.files import make_private, write_atomic
+from dexsim.core.errors import ConfigError
+from dexsim.core.files import write_atomic
 
 
 def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
@@ -71,33 +70,3 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mod
         yield b"3"
 
     write_atomic(tmp_path / "old", chunks())
-
-
-def test_a_private_folder(tmp_path):
-    make_private(tmp_path / "new" / "one")
-    assert (tmp_path / "new" / "one").stat().st_mode & 0o777 == 0o700
-    (tmp_path / "new" / "one").chmod(0o755)
-    make_private(tmp_path / "new" / "one")
-    for mode in (0o775, 0o757):
-        (tmp_path / "new" / "one").chmod(mode)
-        with pytest.raises(PermissionError, match=r"one can be written by others \(chmod go-w\)$"):
-            make_private(tmp_path / "new" / "one")
-
-
-def test_compiled_code_is_not_loaded_from_a_folder_that_others_may_write_to(tmp_path, monkeypatch):
-    """JAX's cache holds code as well."""
-    for name in ("DEXSIM_CACHE", "JAX_COMPILATION_CACHE_DIR"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-    (tmp_path / "xla").mkdir()
-    (tmp_path / "xla").chmod(0o777)
-    before = jax.config.jax_compilation_cache_dir
-    try:
-        with pytest.warns(DexsimWarning, match=r"^no cache of compiled code: [^\n]*xla can be written by others"):
-            cli.enable_caches()
-        assert jax.config.jax_compilation_cache_dir is None
-        (tmp_path / "xla").chmod(0o700)
-        cli.enable_caches()
-        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "xla")
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ranges import draw_alone
 from simple_physics import SimplePhysics
 
 import dexsim
@@ -13,7 +14,6 @@ from dexsim.core.compilation import jit
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.randomization import Randomization
-from dexsim.randomization_check.effects import check
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
@@ -108,17 +108,11 @@ class TestScale:
         np.testing.assert_array_equal(begun.episode.object.mass[:32], np.float32(np.mean(env.config.objects.mass)))
 
 
-def test_the_self_test_finds_every_range_of_taxels(make):
-    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)))
+def test_every_range_of_taxels_reaches_their_readings_and_nothing_else(make):
+    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), Randomization())
     states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
-    names = ("hysteresis", "hysteresis_time", "crosstalk", "gain", "bias", "drift", "dead", "rate")
-    step, paths = jax.jit(jax.vmap(env.step)), [f"sensing.taxel.{name}" for name in names]
-    effects = check(env, step, states, key=jax.random.key(1), ticks=10, names=paths)
-    for name, effect in zip(names, effects, strict=True):
-        leaf = {"hysteresis_time": "memory", "dead": "alive"}.get(name, name)
-        assert (
-            effect.changed == (f"taxels.{leaf}",)
-            and effect.works
-            and effect.which == "taxel_force"
-            and effect.joint == 0
-        )
+    step = jax.jit(jax.vmap(env.step))
+    for name in ("hysteresis", "hysteresis_time", "crosstalk", "gain", "bias", "drift", "dead", "rate"):
+        changed, moved = draw_alone(env, step, states, f"sensing.taxel.{name}", ticks=10)
+        assert changed == [f"taxels.{ {'hysteresis_time': 'memory', 'dead': 'alive'}.get(name, name) }"], name
+        assert [reading for reading, size in moved.items() if size > 0] == ["taxel_force"], name

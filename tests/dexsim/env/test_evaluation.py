@@ -1,5 +1,7 @@
 """What episodes draw: properties of objects anew each time, evaluations from start states that training never had."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from simple_physics import SimplePhysics
 import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.evaluation import evaluation_of, make_plan
+from dexsim.env.evaluation import Evaluation, evaluation_of
 from dexsim.env.state import Start
 from dexsim.objects.config import ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig
@@ -73,6 +75,8 @@ class TestProperties:
 class Rows:
     """As much of a task as a plan needs: eight start states a pool."""
 
+    name, evaluation, evaluation_ticks = "rows", "series", 1
+
     def make_pool(self, key):
         return Start(
             qpos=np.asarray(jax.random.uniform(key, (8, 19))),
@@ -89,15 +93,19 @@ class SimpleObject:
     shape_index: np.ndarray
 
 
+def plan_of(count, seed):
+    return Evaluation(SimpleNamespace(name="rows", task=Rows())).evaluation_plan(count, seed)
+
+
 class TestPlan:
     def test_no_start_is_trainings_and_no_seed_has_anothers(self):
-        plans = [make_plan(Rows(), 8, seed).start.qpos for seed in (0, 1, 2**32 - 1)]
+        plans = [plan_of(8, seed).start.qpos for seed in (0, 1, 2**32 - 1)]
         pools = [rows_of(qpos) for qpos in (Rows().make_pool(jax.random.key(0)).qpos, *plans)]
         assert [len(pool) for pool in pools] == [8] * 4 and len(set.union(*pools)) == 32
 
     @pytest.mark.parametrize("count", [1, 8, 30])
     def test_no_start_repeats_however_many_episodes(self, count):
-        plan = make_plan(Rows(), count, 0)
+        plan = plan_of(count, 0)
         assert len(rows_of(plan.start.qpos)) == len(np.unique(plan.row)) == count
         assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
 

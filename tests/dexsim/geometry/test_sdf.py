@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
 
 EYE = np.eye(3, dtype=np.float32)
@@ -16,18 +15,10 @@ SIZES = {
     "box": (0.02, 0.035, 0.012),
     "capsule": (0.013, 0.022, 0),
     "cylinder": (0.024, 0.017, 0),
-    "ellipsoid": (0.037, 0.016, 0.025),
 }
 
 
 # --- an independent reference: the surface in patches, float64 -----------------------------------
-
-
-def fibonacci(count):
-    """Directions [count, 3] spread evenly over the sphere."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
 
 
 def radial(points, radius, height):
@@ -44,30 +35,12 @@ def ball(points, centre, radius):
     return centre + radius * np.where(length > 0, seen / np.maximum(length, 1e-300), out)
 
 
-def ellipsoid_point(size, points):
-    """By a dense search, then by ever smaller random steps from the best three."""
-    rng = np.random.default_rng(0)
-    best = fibonacci(3000)
-    gap = np.linalg.norm(points[:, None] - best * size, axis=-1)
-    best = best[np.argpartition(gap, 3, axis=1)[:, :3]]  # [P, 3, 3]
-    for spread in 0.1 * 0.75 ** np.arange(60):
-        steps = spread * rng.normal(size=(*best.shape[:2], 16, 3))
-        steps[..., 0, :] = 0
-        tries = best[:, :, None] + steps
-        tries /= np.linalg.norm(tries, axis=-1, keepdims=True)
-        gap = np.linalg.norm(points[:, None, None] - tries * size, axis=-1)
-        best = np.take_along_axis(tries, gap.argmin(-1)[..., None, None], 2)[..., 0, :]
-    return [best[:, start] * size for start in range(3)]
-
-
 def nearest_point(kind, size, points):
     """The nearest point [P, 3] of the surface: of the nearest points of each of its patches, the nearest."""
     a, b, _ = (float(s) for s in size)
     across = np.linalg.norm(points[:, :2], axis=1)
     if kind == "sphere":
         patches = [ball(points, np.zeros(3), a)]
-    elif kind == "ellipsoid":
-        patches = ellipsoid_point(np.asarray(size, float), points)
     elif kind == "box":
         patches = []
         for axis in range(3):
@@ -98,7 +71,6 @@ def is_inside(kind, size, points):
         "box": lambda: np.all(np.abs(points) < size, axis=1),
         "cylinder": lambda: (across < a) & (z < b),
         "capsule": lambda: np.hypot(across, np.maximum(z - b, 0)) < a,
-        "ellipsoid": lambda: np.sum((points / size) ** 2, axis=1) < 1,
     }[kind]()
 
 
@@ -147,15 +119,12 @@ distance_and_normal = jax.jit(sdf.distance_and_normal)
 # --- single primitives ---------------------------------------------------------------------------
 
 
-PROPORTIONS = [(0.02, 0.02, 0.02), (0.05, 0.01, 0.01), (0.03, 0.03, 0.01), (0.011, 0.05, 0.012)]
-
-
-@pytest.mark.parametrize(("kind", "size"), [*SIZES.items(), *(("ellipsoid", size) for size in PROPORTIONS)])
+@pytest.mark.parametrize(("kind", "size"), SIZES.items())
 def test_distance_to_the_nearest_surface_point(kind, size):
     points = probes(size)
     wanted = reference(kind, size, points.astype(float))
     assert (wanted < -1e-3).sum() > 10 and (wanted > 1e-3).sum() > 10
-    np.testing.assert_allclose(distance(points, one(kind, size)), wanted, atol=1e-5 if size in PROPORTIONS else 2e-6)
+    np.testing.assert_allclose(distance(points, one(kind, size)), wanted, atol=2e-6)
 
 
 @pytest.mark.parametrize("kind", sdf.KINDS)
@@ -195,7 +164,7 @@ def pose_gradients(points, shape):
 def posed_union(seed):
     """Three overlapping primitives at random poses, and a fourth far away, as arrays and as a `Shape`."""
     rng = np.random.default_rng(seed)
-    kinds = ("box", "capsule", "ellipsoid", "cylinder")
+    kinds = ("box", "capsule", "sphere", "cylinder")
     size = np.array([SIZES[k] for k in kinds])
     position = rng.uniform(-0.02, 0.02, (4, 3))
     position[3] += 0.2
@@ -213,20 +182,6 @@ def test_a_union_is_the_nearest_of_its_primitives(seed):
     )
     assert (wanted < 0).sum() > 3
     np.testing.assert_allclose(distance(probe, shape), wanted, atol=1e-5)
-
-
-def test_bounds_touch_the_surface_on_every_side():
-    shape = posed_union(7)[-1]
-    for active in ([True, True, True, False], [False, False, True, False]):
-        own = dataclasses.replace(shape, active=jnp.array(active))
-        bounds = sdf.bounds(own)
-        for axis in range(3):
-            for side in range(2):
-                plane = np.stack(np.meshgrid(*np.linspace(*np.delete(bounds, axis, 1), 400).T), -1).reshape(-1, 2)
-                gap = distance(np.insert(plane, axis, bounds[side, axis], 1).astype(np.float32), own)
-                assert -1e-6 <= float(gap.min()) < 3e-4, "points are up to 0.4 mm apart"
-    with pytest.raises(ConfigError, match="no active primitive"):
-        sdf.bounds(dataclasses.replace(shape, active=jnp.zeros(4, bool)))
 
 
 def test_inactive_primitives_do_not_count():

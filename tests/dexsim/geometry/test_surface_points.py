@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from shapes import solid
+from shapes import bounds, solid
 
 from dexsim.geometry import mesh, sdf, surface_points
 
@@ -14,7 +14,6 @@ SIZES = {
     "box": (0.025, 0.02, 0.03),
     "capsule": (0.013, 0.025, 0),
     "cylinder": (0.02, 0.025, 0),
-    "ellipsoid": (0.03, 0.02, 0.04),
 }
 FEW = 300
 nearest = jax.jit(surface_points.nearest)
@@ -32,7 +31,7 @@ def union():
 
 
 def probes(shape, count=2000, room=0.004, seed=0):
-    low, high = sdf.bounds(shape)
+    low, high = bounds(shape)
     return np.random.default_rng(seed).uniform(low - room, high + room, (count, 3)).astype(np.float32)
 
 

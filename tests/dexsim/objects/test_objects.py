@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shapes import bounds
 
-from dexsim.geometry import sdf
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import (
     damping_ratio,
@@ -166,7 +166,7 @@ def test_extent_is_the_bound_of_the_turned_shape():
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32)
         shape = dataclasses.replace(one.shape(), position=one.position @ turn.T, rotation=np.stack([turn] * 3))
         reach = [extent(one.size, one.position, one.active, sign * turn[2]) for sign in (-1, 1)]
-        np.testing.assert_allclose([-reach[0], reach[1]], sdf.bounds(shape)[:, 2], atol=1e-6)
+        np.testing.assert_allclose([-reach[0], reach[1]], bounds(shape)[:, 2], atol=1e-6)
 
 
 # --- the contact's damping -----------------------------------------------------------------------------
@@ -185,15 +185,3 @@ def bounce(ratio, step=1e-5):
 def test_damping_ratio_bounces_as_it_should(restitution):
     ratio = float(damping_ratio(jnp.float32(restitution)))
     assert bounce(ratio) == pytest.approx(restitution, rel=0.01)
-
-
-@pytest.mark.parametrize(("shape", "slot"), [("sphere", CAPSULE), ("box", BOX), ("cylinder", CYLINDER)])
-def test_a_scale_of_zero_leaves_one_object_of_each_kind(shape, slot):
-    config = ObjectConfig()
-    drawn = draw(ObjectConfig(scale=0.0), shape)
-    for leaf in jax.tree.leaves(drawn):
-        np.testing.assert_allclose(leaf, np.broadcast_to(leaf[0], leaf.shape), rtol=1e-6)
-    np.testing.assert_allclose(drawn.mass[0], np.mean(config.mass), rtol=1e-6)
-    np.testing.assert_allclose(drawn.com[0], 0)
-    size = {"sphere": config.sphere_radius, "box": config.box_half, "cylinder": config.cylinder_radius}[shape]
-    np.testing.assert_allclose(drawn.size[0, slot, 0], np.mean(size), rtol=1e-6)

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 from paths import ROOT
-from scipy.spatial.transform import Rotation
 
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
@@ -164,32 +163,6 @@ class TestForces:
             np.testing.assert_allclose(after.qpos[index], data.qpos, atol=1e-5)
         assert touched > len(grips) / 2, "hardly a world is in contact: the test tests nothing"
 
-    def test_a_capsule_over_a_cylinders_rim(self, physics):
-        """One contact, as deep as the nearest point of a finely divided axis, where C MuJoCo would have two others."""
-        (radius, half), (wide, tall) = (0.0103, 0.0271), (0.0215, 0.0203)
-        model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
-          <body><freejoint/><geom type="capsule" size="{radius} {half}"/></body>
-          <body><freejoint/><geom type="cylinder" size="{wide} {tall}"/></body></worldbody></mujoco>""")
-        rng, data, depths = np.random.default_rng(0), mujoco.MjData(model), {}
-        share = np.linspace(-half, half, 20_001)[:, None]
-        for flags in (0, physics.mj_model.opt.disableflags):
-            model.opt.disableflags = flags
-            for _ in range(100):
-                # Beside the rim, the axis hardly above the cap's plane and across it.
-                data.qpos[:3] = rng.uniform(-0.005, 0.005), wide + 0.0093, tall + rng.uniform(-5e-4, 1e-3)
-                turn = Rotation.from_euler("yx", [np.pi / 2, 0]) * Rotation.from_rotvec(rng.normal(size=3) * 0.05)
-                data.qpos[3:7], data.qpos[7:] = np.roll(turn.as_quat(), 1), [0, 0, 0, 1, 0, 0, 0]
-                mujoco.mj_forward(model, data)
-                points = data.qpos[:3] + share * turn.as_matrix()[:, 2]
-                out = np.maximum(np.stack([np.hypot(points[:, 0], points[:, 1]) - wide, abs(points[:, 2]) - tall]), 0)
-                if (depth := np.hypot(*out).min() - radius) < -1e-4:
-                    depths.setdefault(flags, []).append((depth, data.contact.dist.copy()))
-        apart = [max(abs(expected - contacts)) if len(contacts) else -expected for expected, contacts in depths.pop(0)]
-        assert max(apart) > 2e-4, "C MuJoCo has the right contacts by itself: the flag may go"
-        ((_, ours),) = depths.items()
-        assert len(ours) > 50 and {len(contacts) for _, contacts in ours} == {1}
-        np.testing.assert_allclose([contacts[0] for _, contacts in ours], [expected for expected, _ in ours], atol=2e-6)
-
     def test_the_default_iterations_are_enough(self, hand, one_step, grips):
         """From a cold start."""
         physics = make(hand, substeps=1)
@@ -242,14 +215,13 @@ def test_a_gradient_is_refused_by_name(physics, grips):
 
 
 class TestTrouble:
-    def test_a_world_that_diverges_is_marked_and_alone(self, physics, tick, grips):
+    def test_a_world_that_diverges_is_marked_and_alone(self, tick, grips):
         target, state, _ = batch_of(grips[:4])
         push = jnp.zeros((4, 3))
-        expected, counted = tick(target, state, push), physics.engine._engine.diverged
+        expected = tick(target, state, push)
         broken = dataclasses.replace(state, qpos=state.qpos.at[1, 3].set(jnp.nan), qvel=state.qvel.at[2, 14].set(1e12))
         after = tick(target, broken, push)
         assert np.isnan(np.asarray(after[1])[1:3]).all()
-        assert physics.engine._engine.diverged > counted
         sound = jax.tree.map(lambda x: x[np.array([0, 3])], (after, expected))
         assert_same(*sound)
         assert_same(tick(target, state, push), expected)

@@ -10,22 +10,22 @@ import jax
 import numpy as np
 import pytest
 
+from dexsim.geometry import sdf
 from dexsim.hand.load import load_hand
 from dexsim.render import picture, render
+from dexsim.render.camera import Camera, look
 from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
-from dexsim.render.raycast import FAR, Camera, Primitives, cast, hit_points, look, normals, project
+from dexsim.render.picture import Primitives, cast
 from dexsim.render.snapshot import Snapshot
 
-KINDS = ("sphere", "box", "cylinder", "capsule", "ellipsoid")
+KINDS = ("sphere", "box", "cylinder", "capsule")
 SIZES = {
     "sphere": [0.03, 0, 0],
     "box": [0.02, 0.03, 0.025],
     "cylinder": [0.02, 0.03, 0],
     "capsule": [0.015, 0.02, 0],
-    "ellipsoid": [0.02, 0.03, 0.025],
 }
 SMALL = (320, 240)
-CAMERA = render.CAMERAS["grasp"]
 
 
 def primitives(*entries):
@@ -64,54 +64,41 @@ def snapshot(hand, *, active="sphere", force=None):
     )
 
 
-def test_sphere_projects_where_the_pinhole_formula_says():
+@pytest.mark.parametrize("kind", KINDS)
+def test_rays_hit_the_surface_with_outward_normals(kind):
+    """Sizes, poses and the projection are MuJoCo's: by the distance functions that the taxels use."""
+    size, turn, place = np.float32(SIZES[kind]), turned(3), np.float32([0.01, -0.02, 0.03])
+    view = look(Camera(azimuth=40, elevation=30, distance=0.3), (120, 120))
+    rays = view.rays()
+    surface = cast(primitives((kind, size, place))._replace(rotation=turn[None]), view, rays)
+    seen = surface.index == 0
+    assert seen.sum() > 300 and np.all(surface.depth[~seen] == 1e6)
+    points = view.origin + surface.depth[seen][:, None] * rays[seen]
+    shape = sdf.Shape((kind,), size[None], place[None], np.float32(turn)[None], np.ones(1, bool))
+    for away in (0.0, 1e-3):  # along the normal distance grows as fast as it can
+        distance = sdf.signed_distance(np.float32(points + away * surface.normal[seen]), shape)
+        np.testing.assert_allclose(distance, away, atol=2e-5)
+    assert np.all(np.sum(surface.normal[seen] * rays[seen], -1) < 1e-9)
+    rows, columns = np.nonzero(seen)
+    pixels, depth = view.project(points)
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], -1) + 0.5, atol=1e-3)
+    np.testing.assert_allclose(depth, surface.depth[seen], rtol=1e-6)
+
+
+def test_a_sphere_projects_where_the_pinhole_formula_says_and_hides_what_is_behind():
     camera = Camera(azimuth=0, elevation=0, distance=0.5, up=(-1, 0, 0), field_of_view=40)
-    view = look(camera, (300, 200))  # from +z, with -x up: right is +y x ... checked by the offsets below
+    view = look(camera, (300, 200))  # from +z: right = up x back = (-1, 0, 0) x (0, 0, 1) = (0, 1, 0)
     centre, radius = np.array([0.03, -0.02, 0.05]), 0.02
-    surface = cast(primitives(("sphere", [radius, 0, 0], centre)), view)
-    rows, columns = np.nonzero(surface.index == 0)
+    scene = primitives(("box", [0.1, 0.1, 0.01], [0, 0, 0]), ("sphere", [radius, 0, 0], centre))
+    surface = cast(scene, view, view.rays())
+    rows, columns = np.nonzero(surface.index == 1)
     focal, distance = 100 / np.tan(np.deg2rad(20)), 0.5 - 0.05
-    # right = up x back = (-1, 0, 0) x (0, 0, 1) = (0, 1, 0)
     expected = 150 + focal * centre[1] / distance, 100 + focal * centre[0] / distance
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], expected, atol=0.7)
     seen_radius = focal * radius / np.sqrt(distance**2 - radius**2)
     np.testing.assert_allclose(np.sqrt(len(rows) / np.pi), seen_radius, rtol=0.02)
     np.testing.assert_allclose(surface.depth.min(), distance - radius, rtol=1e-3)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_ray_hits_lie_on_the_surface_and_normals_point_outward(kind):
-    size, turn = np.asarray(SIZES[kind]), turned(3)
-    scene = primitives((kind, size, [0.01, -0.02, 0.03]))._replace(rotation=turn[None])
-    view = look(Camera(azimuth=40, elevation=30, distance=0.3), (120, 120))
-    surface = cast(scene, view)
-    row, column = np.nonzero(surface.index == 0)
-    assert len(row) > 300
-    points = hit_points(view, row, column, surface.depth[row, column])
-    p = (points - scene.position[0]) @ turn
-    if kind == "sphere":
-        distance = np.linalg.norm(p, axis=-1) - size[0]
-    elif kind == "box":
-        distance = np.max(np.abs(p) - size, -1)
-    elif kind == "capsule":
-        distance = np.linalg.norm(p - np.clip(p, [0, 0, -size[1]], [0, 0, size[1]]), axis=-1) - size[0]
-    elif kind == "cylinder":
-        distance = np.maximum(np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1])
-    else:
-        distance = (np.linalg.norm(p / size, axis=-1) - 1) * size.min()
-    np.testing.assert_allclose(distance, 0, atol=2e-5)
-    normal = normals(scene, surface.index[row, column], points)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
-    assert np.mean(np.sum(normal * (view.origin - points), 1) > 0) > 0.95  # edges look rounded, past the silhouette too
-
-
-def test_nearer_occludes_farther_whatever_the_order():
-    view = look(Camera(azimuth=0, elevation=0, distance=0.5), (100, 100))
-    near, far = ("sphere", [0.02, 0, 0], [0, 0, 0.1]), ("box", [0.05, 0.05, 0.01], [0, 0, 0])
-    assert cast(primitives(near, far), view).index[50, 50] == 0
-    assert cast(primitives(far, near), view).index[50, 50] == 1
-    assert cast(primitives(near, far), view).index[50, 68] == 1  # beside the sphere, on the box
-    assert cast(primitives(near, far), view).depth[0, 0] == FAR
+    assert surface.index[100, 200] == 0  # beside the sphere, on the box
 
 
 def test_more_force_is_hotter():
@@ -173,7 +160,7 @@ def test_a_loaded_taxel_shows_on_the_finger(hand):
     frames = [render.render_frame(hand, KINDS, s, size=size, force_range=2.0)[:, :400].astype(int) for s in (cold, hot)]
     rows, columns = np.nonzero(np.any(frames[0] != frames[1], -1))
     assert 3 <= len(rows) < 200
-    pixel, _ = project(view, pose.taxel_position[finger, taxel])
+    pixel, _ = view.project(pose.taxel_position[finger, taxel])
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixel, atol=2)
     assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
 
@@ -187,7 +174,7 @@ def quarter(axis):
 def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
     without = snapshot(hand, active="box")
     view = look(render.CAMERAS["rotate"], (200, 240))
-    x, y = project(view, picture.goal_position(render.CAMERAS["rotate"]))[0].astype(int)
+    x, y = view.project(picture.goal_position(render.CAMERAS["rotate"]))[0].astype(int)
     frames = [
         render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate")[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1))
         for s in (without, *(dataclasses.replace(without, goal_rotation=turn) for turn in (np.eye(3), quarter(0))))

@@ -159,7 +159,6 @@ class TestReward:
             "total_force": 7.005,
             "total_torque": 0.11 / 1.1 + 0.33 / 1.1,
             "taxel_force": 5.0,
-            "skin_force": 2.5,
             "thumb_force": 2.0,
             "touching": 2.0,
             "joint_speed": 2.0 / 12,

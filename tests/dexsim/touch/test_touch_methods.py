@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shapes import solid
+from shapes import bake, solid
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, rotations, sdf, surface_points
@@ -55,7 +55,7 @@ def test_every_method_feels_the_same_grasp(hand, links, method):
     feel, *_ = links
     skin = Skin(margin=0.001)
     exact, force, centre = feel(BALL, skin)
-    other = grid.bake(BALL, nodes=48) if method == "grid" else surface_points.from_shape(BALL, 2048)
+    other = bake(BALL, nodes=48) if method == "grid" else surface_points.from_shape(BALL, 2048)
     ours, other_force, other_centre = feel(other, skin)
     bound = {"grid": 2.5e-5, "surface_points": 8e-5}[method]
     np.testing.assert_allclose(ours.depth, exact.depth, atol=bound)
