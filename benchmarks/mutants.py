@@ -117,7 +117,7 @@ def main() -> None:
     command = f"{sys.executable} -m pytest -x -q -p no:cacheprovider"
     if arguments.processes > 1:
         command += f" -n {arguments.processes} --dist loadfile --no-loadscope-reorder"
-    until, limits, killed, survived = time.monotonic() + 60 * arguments.minutes, dict[str, float](), 0, list[str]()
+    until, limits, killed, undecided = time.monotonic() + 60 * arguments.minutes, dict[str, float](), 0, 0
 
     def notice(mutant: Mutant, tests: str) -> bool:
         """Whether these tests, which pass on the unchanged copy, fail with a change."""
@@ -136,13 +136,18 @@ def main() -> None:
             shutil.copy(ROOT / name, Path(copy, name))
         os.chdir(copy)
         os.environ["PYTHONPATH"] = copy
-        for mutant in sample(arguments.count, arguments.seed):
-            if time.monotonic() > until:
-                break
-            noticed = any(notice(mutant, tests) for tests in TESTS[mutant.folder])
-            print("killed  " if noticed else "SURVIVED", mutant, flush=True)
-            survived += [] if noticed else [str(mutant)]
-            killed += noticed
+        left = sample(arguments.count, arguments.seed)
+        for stage in range(2):
+            passed = list[Mutant]()
+            while left and time.monotonic() < until:
+                mutant = left.pop(0)
+                if notice(mutant, TESTS[mutant.folder][stage]):
+                    killed += 1
+                else:
+                    passed.append(mutant)
+                    print("SURVIVED" if stage else "nearest tests pass", mutant, flush=True)
+            undecided, left = undecided + len(left), passed
+    survived = [str(mutant) for mutant in left]
     commit, count = _git("rev-parse", "--short=7", "HEAD").strip(), killed + len(survived)
     record = {
         "id": f"mutants-{commit}-seed{arguments.seed}",
@@ -152,7 +157,7 @@ def main() -> None:
         "command": f"python benchmarks/mutants.py --count {arguments.count} --seed {arguments.seed}",
         "hardware": f"{arguments.processes} of {os.cpu_count()} CPU cores",
         "seeds": [arguments.seed],
-        "metrics": {"mutants": count, "killed": killed, "survived": survived},
+        "metrics": {"mutants": count, "killed": killed, "survived": survived, "undecided": undecided},
         "verdict": f"{100 * killed / count:.0f} % noticed by the default tests; target 95 %",
         "tags": ["tests"],
         "notes": "",

@@ -27,12 +27,15 @@ class MemoryLine:
         self.peer, self.timeout, self.clock = peer, timeout, clock
         self.parser, self.coming = Parser(HOST_REQUESTS), []  # (time at which it is there, bytes)
 
-    def _there(self):
-        return b"".join(data for when, data in self.coming if when <= self.clock.monotonic())
-
     @property
     def in_waiting(self):
-        return len(self._there())
+        return len(self._arrived()[0])
+
+    def _arrived(self):
+        """The bytes that are there, and what is still coming."""
+        now = self.clock.monotonic()
+        there = b"".join(data for when, data in self.coming if when <= now)
+        return there, [(when, data) for when, data in self.coming if when > now]
 
     def write(self, data):
         for frame in self.parser.feed(bytes(data)):
@@ -40,11 +43,10 @@ class MemoryLine:
             self.coming.append((self.clock.monotonic() + self.peer.delay, reply))
 
     def read(self, size):
-        if not self._there():
+        if not self.in_waiting:
             wait = min((when - self.clock.monotonic() for when, data in self.coming if data), default=self.timeout)
             self.clock.sleep(min(max(wait, 1e-6), self.timeout))
-        there = self._there()
-        later = [(when, data) for when, data in self.coming if when > self.clock.monotonic()]
+        there, later = self._arrived()
         self.coming = [(0.0, there[size:]), *later]
         return there[:size]
 
