@@ -4,6 +4,7 @@
 #   make train ARGS="--steps 2e6"     options of `python -m dexsim_ppo.train`
 #   make docs                         the documentation site, in site/
 #   make test ARGS="-k touch"         options of pytest (which runs on two processes)
+#   make mutants ARGS="--seed 1"      an hour of small changes in the code: do the tests notice?
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
 #   make EXTRAS=cuda train       other extras than the ones chosen by the device found
 
@@ -22,8 +23,9 @@ INSTALLED := $(VENV)/.installed-$(subst $(comma),-,$(EXTRAS))
 TESTABLE := $(VENV)/.testable
 DOCUMENTABLE := $(VENV)/.documentable
 LINTABLE := $(VENV)/.lintable
+MUTABLE := $(VENV)/.mutable
 
-.PHONY: train test lint docs clean help
+.PHONY: train test mutants lint docs clean help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -35,6 +37,9 @@ train: $(INSTALLED)
 
 test: $(TESTABLE)
 	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+
+mutants: $(MUTABLE)
+	$(PY) benchmarks/mutants.py $(ARGS)
 
 lint: $(LINTABLE)
 	$(PY) -m ruff check $(ARGS)
@@ -64,6 +69,10 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
 	$(PIP) install --quiet --editable ".[brax,video,tb,view,onnx,lerobot,gym,docs]" --group test
+	@touch $@
+
+$(MUTABLE): $(TESTABLE)
+	$(PIP) install --quiet --group mutants
 	@touch $@
 
 # With the extras whose modules the reference imports.

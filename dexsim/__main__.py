@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
+from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
 
 COMMANDS = {
     "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
@@ -47,7 +48,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
     if name == "train":
         cli.announce(cli.LOADING)
-    return importlib.import_module(COMMANDS[name][0]).main(rest)
+    exit_on_interrupt()
+    module = importlib.import_module(COMMANDS[name][0])
+    restore_interrupt()
+    return module.main(rest)
 
 
 def console() -> None:

@@ -1,6 +1,9 @@
 """The console command `dexsim`: every command under its word, and errors that name the page that helps."""
 
 import importlib
+import os
+import subprocess
+import sys
 
 import pytest
 from paths import ROOT
@@ -53,3 +56,25 @@ def test_an_error_names_the_page_that_helps(error, capsys):
     assert stop.value.code == 2 and capsys.readouterr().err == f"error: something is wrong{helps}\n"
     headings = (ROOT / page).read_text().lower().replace(" ", "-") if page else ""
     assert not anchor or f"#-{anchor}\n" in headings
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["dexsim_real.run", "dexsim_real.calibrate", "dexsim_real.twin", "dexsim_ppo.train", "dexsim.view", "dexsim train"],
+)
+def test_ctrl_c_while_modules_load_is_one_line(words, tmp_path):
+    """Sent while a module is looked for that each command imports late."""
+    (tmp_path / "sitecustomize.py").write_text("""
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+""")
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    command = [sys.executable, "-m", *words.split()]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 130 and done.stderr.splitlines()[-1] == "interrupted" and "Traceback" not in done.stderr

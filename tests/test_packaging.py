@@ -18,7 +18,7 @@ def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
     """Run `code` in a fresh interpreter, with `path` in front of everything importable."""
     start = f"import sys; sys.path.insert(0, {str(path)!r})\n" if path else ""
     done = subprocess.run(
-        [sys.executable, "-P", "-c", start + code], cwd=cwd, capture_output=True, text=True, timeout=120
+        [sys.executable, "-P", "-c", start + code], cwd=cwd, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
     return done.stdout

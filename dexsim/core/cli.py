@@ -17,6 +17,7 @@ from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import is_device, write_atomic
 from dexsim.core.install import DISTRIBUTION
+from dexsim.core.lazy_loading import restore_interrupt
 
 T = TypeVar("T")
 
@@ -27,6 +28,7 @@ LOADING = "loading JAX and MuJoCo"
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
     warnings.showwarning = _show_warning
+    restore_interrupt()
     try:
         code = main(None)
     except DexsimError as error:

@@ -1,6 +1,10 @@
-"""Public names of a package that are imported at first use (PEP 562)."""
+"""Public names of a package that are imported at first use (PEP 562), and Ctrl-C while modules load."""
 
 import importlib
+import os
+import signal
+import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,3 +20,25 @@ def lazy_exports(
         return getattr(importlib.import_module(homes[name]), name)
 
     return getattribute, lambda: sorted(names)
+
+
+def exit_on_interrupt() -> None:
+    """From now on Ctrl-C ends the program with one line: modules that load abort, or show pages of their insides."""
+    main_thread = threading.current_thread() is threading.main_thread()
+    if main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
+
+
+def restore_interrupt() -> None:
+    """From now on Ctrl-C raises KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is _leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _leave(number: int, frame: Any) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
+
+
+if sys.argv[:1] == ["-m"]:  # `python -m` with one of our modules, which is still to be found.
+    exit_on_interrupt()

@@ -69,7 +69,7 @@ from portable import PortablePolicy
 policy = PortablePolicy.load("grasp.msgpack")
 np.save("action.npy", policy.act(policy.initial_carry(1000), np.load("obs.npy"))[1])
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     expected = policy.act(policy.initial_carry(1000), obs)[1]
     assert np.abs(np.load(tmp_path / "action.npy") - np.asarray(expected)).max() < 1e-5

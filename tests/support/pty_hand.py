@@ -33,6 +33,7 @@ class PtyHand:
         self.state = frames.empty_state()
         self.state["joint"]["temperature"] = 30
         self.commands: list[np.ndarray] = []
+        self.delay = 0.0  # s, of the next answer on a line in memory
         self.master = self.slave = -1
         self.port = ""
         self._folder = tempfile.TemporaryDirectory()
@@ -74,12 +75,13 @@ class PtyHand:
             if not select.select([self.master], [], [], 0.01)[0]:
                 continue
             for frame in parser.feed(os.read(self.master, 4096)):
-                reply = self._reply(frame)
+                reply = self.reply(frame)
                 while reply and not self._stop.is_set():  # The kernel's buffer holds 4 KiB.
                     if select.select([], [self.master], [], 0.01)[1]:
                         reply = reply[os.write(self.master, reply[:1024]) :]
 
-    def _reply(self, frame: Frame) -> bytes:
+    def reply(self, frame: Frame) -> bytes:
+        """The answer to a request; empty for silence."""
         if frame.command == Command.VERSION:
             return b"" if self.version is None else Frame(0x80, 0xFE, Command.VERSION, self.version).encode()
         if frame.command == Command.READ_REGISTER:

@@ -326,7 +326,7 @@ def test_programs_in_flight_do_not_block_each_other():
     """With asynchronous dispatch, as many programs as fit wait for the host on one core."""
     one_core = "import os; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])"
     process = start(BUSY, 64, one_core)
-    out, _ = process.communicate(timeout=120)
+    out, _ = process.communicate(timeout=300)
     assert process.returncode == 0 and json.loads(out) == 1
 
 
@@ -335,7 +335,7 @@ def test_ctrl_c_while_the_pool_runs():
     process = start(LONG, 64)
     assert process.stdout.readline() == "running\n"
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=300)
     assert out.startswith("stopped") and process.returncode == 0
 
 
@@ -346,7 +346,7 @@ def test_programs_are_cached(tmp_path):
     runs = []
     for _ in range(2):
         process = start(CACHED, 4, **options)
-        out, _ = process.communicate(timeout=120)
+        out, _ = process.communicate(timeout=300)
         assert process.returncode == 0
         runs.append(json.loads(out))
     assert runs[0][0] == 0 and runs[1][0] > 0

@@ -133,6 +133,15 @@ def test_every_group_has_the_statistics_of_its_own_observations():
     assert np.all(np.asarray(actor.variance) > 1e-3)
 
 
+def test_the_first_minibatch_meets_the_policy_that_collected_it():
+    """With the normalisers of the collection: the divergence is zero, and no ratio is clipped."""
+    training = make_train(TinyEnv(), dataclasses.replace(SMALL, epochs=1, minibatches=1))
+    state = training.init(jax.random.key(0))
+    for _ in range(3):
+        state, metrics = training.step(state)
+        assert abs(float(metrics["kl"][0])) < 1e-6 and float(metrics["clip_fraction"][0]) == 0.0
+
+
 def test_the_environment_gets_the_action_clipped():
     env, config = Watched(), dataclasses.replace(SMALL, initial_std=1.0)
     state = make_train(env, config).init(jax.random.key(0))

@@ -126,7 +126,8 @@ def test_a_full_disk_ends_the_log_and_not_the_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "write", full)
     log.add(Kind.NOTE, "lost")
-    time.sleep(0.2)
+    while not log.failure:
+        time.sleep(0.01)
     log.add(Kind.NOTE, "lost too")
     monkeypatch.setattr(os, "write", real)
     log.close()
@@ -144,7 +145,7 @@ def test_a_record_that_cannot_be_written_is_counted_and_costs_no_other(tmp_path)
 
 
 def test_killed_at_any_moment_all_but_the_last_moment_is_there(tmp_path):
-    """SIGKILL, again and again: every log opens, and lacks at most half a second."""
+    """SIGKILL, again and again: every log opens, and what had reached the kernel is there, whole and in order."""
     code = """
 import sys, time
 from dexsim_real.core.log import Kind, LogWriter
@@ -163,9 +164,10 @@ while True:
         started.append((path, process))
     for path, process in started:
         assert process.stdout.readline() == b"ready\n"
-        time.sleep(float(rng.uniform(0.2, 0.7)))
-        killed = time.monotonic()
+        written = int(rng.integers(20_000, 100_000))  # bytes; a writer that waited for the end would have none
+        while path.stat().st_size < written:
+            time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
         process.wait()
         notes = [float(record.content) for record in LogReader(path) if record.kind == Kind.NOTE]
-        assert notes == sorted(notes) and killed - notes[-1] < 0.5
+        assert notes == sorted(notes) and len(notes) >= written // 2300

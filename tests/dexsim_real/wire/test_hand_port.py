@@ -5,8 +5,8 @@ import errno
 import os
 import re
 import termios
-import time
 
+import memory_line
 import numpy as np
 import pytest
 from pty_hand import QUICK, PtyHand
@@ -36,16 +36,15 @@ def test_why_a_hand_does_not_answer(answer, says):
         SerialHand(peer.port, QUICK).connect()
 
 
-def test_answers_that_come_too_soon_or_too_late_are_told_apart():
+def test_answers_that_come_too_soon_or_too_late_are_told_apart(monkeypatch):
     """Of an emulated line without pace; or each so late that it meets the next request."""
-    with PtyHand() as peer, pytest.raises(HandError, match="sooner than 3000000 baud.*--link.no-paced"):
-        SerialHand(peer.port, dataclasses.replace(QUICK, paced=True)).connect()
-    config = dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)
-    with (
-        PtyHand(lambda *_: time.sleep(0.15), version=None) as peer,
-        pytest.raises(HandError, match="too late; raise --link.margin"),
-    ):
-        SerialHand(peer.port, config).connect()
+    soon, late = "sooner than 3000000 baud.*--link.no-paced", "too late; raise --link.margin"
+    for version, delay, says in ((b"1", 0.0, soon), (None, 0.15, late)):
+        peer = PtyHand(version=version)
+        peer.delay = delay
+        memory_line.connect(monkeypatch, peer, memory_line.Clock())
+        with pytest.raises(HandError, match=says):
+            SerialHand("loop://", dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)).connect()
 
 
 def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():

@@ -64,16 +64,17 @@ def test_noise_on_the_line_is_answered_with_silence(noise):
 
 
 def test_the_driver_talks_to_it(hand, tmp_path):
-    with Running(tmp_path, task="rotate", watchdog=0.08) as running:
+    with Running(tmp_path, task="rotate", watchdog=2.0) as running:
         with pytest.raises(HandError):  # At another baud rate it understands nothing.
             SerialHand(running.port, LinkConfig(baud=115200, settle=0.0, handshake=0.1)).connect()
-        port = SerialHand(running.port, LinkConfig(settle=0.0, margin=0.2))
+        port = SerialHand(running.port, LinkConfig(settle=0.0, margin=1.0))
         assert "firmware 1.3.9" in port.connect()
         goal, replies = REST + 0.05, []
         for k in range(30):
             replies.append(port.exchange(command(REST if k < 2 else goal)))
         port.close()
-        time.sleep(0.15)
+        while not running.twin.report()["watchdog_trips"]:
+            time.sleep(0.05)
     first, last = replies[0].state["joint"], replies[-1].state["joint"]
     np.testing.assert_allclose(first["position"], REST, atol=1e-3)
     np.testing.assert_allclose(last["position"], goal, atol=3e-3)
