@@ -30,6 +30,7 @@ from dexsim.catalog import catalog
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.core.files import read_small
 from dexsim.core.install import require
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
@@ -245,7 +246,7 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     """The options in `config.json` of a run, or of the run in this folder. Raises ConfigError if of another task."""
     file = RunFolder(path).config if path.is_dir() else path
     try:
-        saved = json.loads(file.read_text("utf-8-sig"))["arguments"]
+        saved = json.loads(read_small(file))["arguments"]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
     if task and task.rpartition(":")[2] != saved["task"]:

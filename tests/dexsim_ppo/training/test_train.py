@@ -125,6 +125,7 @@ TRAIN_ERRORS = {
     "another task": (["--task", "grasp", "--resume", "RUN"], "of the task 'tiny', not 'grasp'"),
     "another task's options": (["--task", "grasp", "--config", "RUN"], "of the task 'tiny', not 'grasp'"),
     "no configuration": (["--config", "none.json"], "no configuration of a run"),
+    "no end": (["--config", "/dev/zero"], "larger than 1 MiB"),
     "a huge number": (["--task", "grasp", "--evaluate-every", str(10**30)], "must be at most 9.22"),
     "two beginnings": (["--config", "RUN", "--resume", "RUN"], "leave --resume"),
     "another seed": (["--resume", "RUN", "--seed", "9"], "--seed 9: a resumed run keeps its 0"),
