@@ -25,6 +25,7 @@ COMMANDS = {
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
     "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
+    "mirror-hand": ("dexsim.hand.mirror", "write the mirror image of a hand"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
 }
 """Module and purpose of each command."""
