@@ -2,8 +2,8 @@
 
     dexsim mirror-hand my_right.toml --out my_left
 
-The palm's frame and every link's are reflected in their planes y = 0. Joint axes are axial vectors: the same angle turns
-a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
+The palm's frame and every link's are reflected in their planes y = 0. Joint axes are axial vectors: the same angle
+turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
 """
 
 import csv
@@ -52,7 +52,8 @@ _SAME = 1e-4  # m, between a lattice and its mirror image that are one part
 def mirror_hand(hand: Hand) -> Hand:
     """The mirror image of a hand's description. `model_path` and names stay: files are mirrored by `write_mirror`."""
     geoms = tuple(
-        dataclasses.replace(geom, position=geom.position * POLAR, rotation=geom.rotation * MATRIX) for geom in hand.geoms
+        dataclasses.replace(geom, position=geom.position * POLAR, rotation=geom.rotation * MATRIX)
+        for geom in hand.geoms
     )
     return dataclasses.replace(
         hand,
