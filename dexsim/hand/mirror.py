@@ -105,17 +105,18 @@ def mirror_name(name: str, side: str) -> str:
 
 def mirror_toml(text: str, stem: str) -> str:
     """The mirror image's TOML, whose files are `stem`.xml and `stem`_taxels.csv."""
-    side = OTHER[tomllib.loads(text).get("side", "right")]
+    table = tomllib.loads(text)
     text = re.sub(r"^[^#\n]+", lambda match: swap_sides(match[0]), text, flags=re.MULTILINE)  # comments stay
     # Of positions [3], the second number. Other entries are names, or the same for either hand.
     second = r"(\b(?:centre|reference|facing)\s*=\s*\[[^],]*,\s*)([^],]*)"
     text = re.sub(second, lambda match: match[1] + _negate(match[2]), text)
     text = re.sub(r'^(model\s*=\s*)"[^"]*"', rf'\1"{stem}.xml"', text, flags=re.MULTILINE)
     text = re.sub(r'^(taxels\s*=\s*)"[^"]*"', rf'\1"{stem}_taxels.csv"', text, flags=re.MULTILINE)
-    text = re.sub(r'^name\s*=\s*"[^"]*"', f'name = "{stem}"', text, count=1, flags=re.MULTILINE)
-    if "side" in tomllib.loads(text):
+    if "name" in table:  # the first of that name; the others are fingers'
+        text = re.sub(r'^name\s*=\s*"[^"]*"', f'name = "{stem}"', text, count=1, flags=re.MULTILINE)
+    if "side" in table:  # swapped above
         return text
-    return re.sub(r"^(?=[^#\s])", f'side = "{side}"\n', text, count=1, flags=re.MULTILINE)
+    return re.sub(r"^(?=[^#\s])", 'side = "left"\n', text, count=1, flags=re.MULTILINE)
 
 
 def mirror_mjcf(model: ElementTree.Element) -> None:
