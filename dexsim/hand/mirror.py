@@ -16,7 +16,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -31,7 +31,8 @@ from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 
 OTHER = {"right": "left", "left": "right"}
-_SIGNS = {
+Point = TypeVar("Point", bound=tuple[float, ...])
+_SIGNS: dict[str, tuple[int, ...]] = {
     "pos": (1,),
     "dir": (1,),
     "zaxis": (1,),
@@ -71,9 +72,9 @@ def mirror_hand(hand: Hand) -> Hand:
     )
 
 
-def mirror_point(point: Sequence[float]) -> tuple[float, ...]:
+def mirror_point(point: Point) -> Point:
     """The mirror image of a position [3] m; of an empty one itself."""
-    return tuple(-value if axis == 1 else value for axis, value in enumerate(point))
+    return cast(Point, tuple(-value if axis == 1 else value for axis, value in enumerate(point)))
 
 
 def is_mirror_image(hand: Hand, other: Hand) -> bool:

@@ -71,7 +71,7 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
 def _is_mirrored(record: Record | None, hand: Hand) -> bool:
     """Whether a hand is the mirror image of the recorded one; not known where that one's files are missing."""
     with contextlib.suppress(AssetError):
-        path = find_hand(record and record["file"])
+        path = find_hand(record["file"] if record else None)
         return path.suffix == ".toml" and is_mirror_image(hand, load_hand(path))
     return False
 

@@ -75,8 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = Path(folder) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
-        identity = {"serial": SERIALS[hand.side], "handedness": hand.side}
-        save_calibration(calibration, dataclasses.replace(ideal_calibration(hand), **identity))
+        known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
+        save_calibration(calibration, known)
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()
         try:
