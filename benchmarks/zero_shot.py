@@ -38,7 +38,7 @@ COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @functools.lru_cache(maxsize=2)
-def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
+def load(name: str, idle: bool, hand_name: str = "") -> tuple[Any, Any, Any]:
     """Hand, controller and calibration; loaded once per process. An idle policy's actions are zero."""
     from dexsim_real.control.controller import Controller, prepare_jax
 
@@ -49,7 +49,7 @@ def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
     from dexsim_ppo.policy import load_policy
     from dexsim_real.twin.virtual import ideal_calibration
 
-    hand, policy = load_hand(), load_policy(name)
+    hand, policy = load_hand(hand_name), load_policy(name)
     if idle:
         layers = jax.tree.map(np.zeros_like, policy.params.layers)
         policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=layers))
@@ -66,7 +66,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
 
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    hand, controller, calibration = load(options["policy"], options.get("idle", False))
+    hand, controller, calibration = load(options["policy"], options.get("idle", False), options.get("hand", ""))
     plant = EmulatedHand(
         hand,
         options["task"],
@@ -151,6 +151,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add = parser.add_argument
     add("--task", choices=("grasp", "rotate"), required=True)
     add("--policy", help="policy file; by default the shipped policy of the task")
+    add("--hand", default="", help="TOML or name of a hand with the XHand's joints and taxels")
     add("--trials", type=_whole(1), default=10, help="of each seed")
     add("--seed", type=_whole(0), nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")

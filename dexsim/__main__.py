@@ -24,6 +24,7 @@ COMMANDS = {
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
+    "mirror-hand": ("dexsim.hand.mirror", "write the mirror image of a hand"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
 }
 """Module and purpose of each command."""

@@ -16,7 +16,9 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
+from dexsim.geometry.mirror import AXIAL, POLAR, QUAT
 from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics, tip_twist
+from dexsim.hand.mirror import mirror_hand
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim.touch.reduce import reduce_touch_links
 
@@ -185,6 +187,24 @@ ROTATE_CRITIC = (
 )
 
 
+def mirror_readings(readings: Readings) -> Readings:
+    """What the mirror image of a hand measures in the mirrored scene: joints, taxels and actions are the same."""
+    gravity = readings.palm_gravity
+    return dataclasses.replace(
+        readings,
+        object_position=readings.object_position * POLAR,
+        object_velocity=readings.object_velocity * POLAR,
+        object_quat=readings.object_quat * QUAT,
+        goal_quat=readings.goal_quat * QUAT,
+        palm_gravity=None if gravity is None else gravity * POLAR,
+    )
+
+
+def mirror_motion(motion: Motion) -> Motion:
+    """The motion in the mirrored scene."""
+    return Motion(motion.joint_velocity, motion.object_spin * AXIAL)
+
+
 def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[LayoutEntry, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
     chosen = [FIELDS[name] for name in select_fields(names, config)]
@@ -207,6 +227,8 @@ def observe(
 ) -> jax.Array:
     """The observation vector: the only road from measurements to a policy.
 
+    A left hand is observed as its mirror image, so that a policy of a right hand moves it, and the other way round.
+
     Args:
       hand: the hand's description (static).
       readings: one tick of measurements.
@@ -218,6 +240,8 @@ def observe(
     Returns:
       [sum of the layout's sizes] float32, not normalised.
     """
+    if hand.side == "left":
+        return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion and mirror_motion(motion))
     if pose is None:
         pose = forward_kinematics(hand, readings.joint_position)
     force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)

@@ -16,6 +16,7 @@ from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import correct_command
 from dexsim.hand.kinematics import Hand
+from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.estimate import estimate_force
 
@@ -42,6 +43,10 @@ class TurnSpec(Config):
         if abs(self.step) < 0.1:
             raise ConfigError(f"TurnSpec.step = {self.step:g} rad: must be at least 0.1 rad to either side")
 
+    def mirror(self) -> "TurnSpec":
+        """The turn in a mirror: the mirrored axis, the other way round."""
+        return dataclasses.replace(self, axis=mirror_point(self.axis), step=-self.step)
+
     @property
     def unit_axis(self) -> np.ndarray:
         """The axis [3], of length one."""
@@ -50,7 +55,7 @@ class TurnSpec(Config):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TaskSpec(Config):
-    """One task, as a host sees it. SI units, palm frame."""
+    """One task, as a host sees it. SI units, palm frame; in a policy's file that of a right hand."""
 
     name: str
     """The task's name."""
@@ -102,6 +107,14 @@ class TaskSpec(Config):
             turn=task.turn,
             finger_force=task.finger_force,
         )
+
+    def mirror_for(self, hand: Hand) -> "TaskSpec":
+        """From the frame of a right hand to that of this one, or back: the mirror image if it is a left one."""
+        if hand.side == "right":
+            return self
+        turn = self.turn and self.turn.mirror()
+        gravity, reference = mirror_point(self.gravity), mirror_point(self.reference)
+        return dataclasses.replace(self, gravity=gravity, reference=reference, turn=turn)
 
     def check_hand(self, hand: Hand) -> None:
         """Raises ConfigError: the start posture is of another hand."""

@@ -52,7 +52,7 @@ class Env:
         config = task.config
         check_timestep(hand, config.physics, config.randomization)
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
-        self.spec = TaskSpec.of(task)  # what a host must know to run this task's policies
+        self.spec = TaskSpec.of(task).mirror_for(hand)  # what a host must know to run this task's policies
         self.spec.check_hand(hand)
         self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots

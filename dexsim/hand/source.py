@@ -4,14 +4,16 @@ A record is plain data: the TOML's name as it was given, a hash of the hand's fi
 stands for the shipped default hand.
 """
 
+import contextlib
 import warnings
 from pathlib import Path
 from typing import Any
 
-from dexsim.core.errors import ConfigError, OtherEnvWarning
+from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
 from dexsim.hand.files import DEFAULT, find_hand
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
+from dexsim.hand.mirror import is_mirror_image
 
 Record = dict[str, Any]
 
@@ -36,7 +38,8 @@ def check_same(record: Record | None, hand: Hand, what: str) -> None:
 def recorded_hand(record: Record | None, given: str | Path | None, what: str) -> Hand | None:
     """The hand of something recorded: the `given` one, or the one that the record names; None for the default one.
 
-    Files that were changed since are refused. A given file of the same joints, fingers and taxels is warned of.
+    Files that were changed since are refused. A given file of the same joints, fingers and taxels is warned of, unless
+    it is the recorded hand's mirror image (`dexsim.observation.observe`).
 
     Raises:
       ConfigError: the hand is another one, or its record is invalid.
@@ -55,7 +58,7 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
         return hand
     hand = load_hand(given)
     now = record_of(hand)
-    if (record and record["digest"]) != (now and now["digest"]):
+    if (record and record["digest"]) != (now and now["digest"]) and not _is_mirrored(record, hand):
         before: Any = record or record_as_of(load_hand())
         if before | {"file": "", "digest": ""} != record_as_of(hand) | {"file": "", "digest": ""}:
             check_same(record, hand, what)
@@ -63,6 +66,14 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
             f"{what} is of the hand {_name(record)}, and is used on {_name(now)}", OtherEnvWarning, stacklevel=3
         )
     return hand
+
+
+def _is_mirrored(record: Record | None, hand: Hand) -> bool:
+    """Whether a hand is the mirror image of the recorded one; not known where that one's files are missing."""
+    with contextlib.suppress(AssetError):
+        path = find_hand(record["file"] if record else None)
+        return path.suffix == ".toml" and is_mirror_image(hand, load_hand(path))
+    return False
 
 
 def check_record(record: Any) -> None:

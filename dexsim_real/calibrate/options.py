@@ -38,6 +38,8 @@ class CalibrateArguments(Config):
     port: str | None = None
     """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION. None only with
     --from-log."""
+    hand: str = ""
+    """The TOML of a hand, or the name of a shipped one (`xhand_left`); empty for the right XHand."""
     output: Path | None = None
     """Output file; None for hand.toml, or hand.json with --identify."""
     force: bool = False

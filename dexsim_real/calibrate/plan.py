@@ -49,7 +49,6 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
     columns, rows = hand.taxel_grid
     middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
-    side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
     plan = []
     for finger in sorted(selected, key=lambda i: i == 0):
         # Bent a little more than the others.
@@ -59,6 +58,9 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
         plan.append(_placement(hand, f"{name} pad", finger, middle, bent, task))
     for finger in [i for i in selected if sides and i in _SIDES]:
         name = hand.finger_names[finger]
+        # The index finger of a left hand has the sensor of a right one: its first columns face the thumb.
+        column = 1 if finger == 1 and hand.side == "left" else columns - 2
+        side = [column * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
         bent = {0: 0.4} if finger == 0 else {3: -0.1, 4: 0.35, 5: 0.1}
         task = f"hold the pen across the side of the {name} that faces the {_SIDES[finger]}, 3 mm in front of it"
         plan.append(_placement(hand, f"{name} side", finger, side, bent, task))

@@ -60,7 +60,7 @@ class Controller:
         self.policy, self.hand = policy, hand
         if policy.spec is None:
             raise HandError(f"the policy of the task {policy.task!r} carries no task specification")
-        self.spec = policy.spec
+        self.spec = policy.spec.mirror_for(hand)
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
         self.sources = sources_of(select_fields(names, config))

@@ -25,7 +25,7 @@ from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.twin.wire.firmware import HANDEDNESS, SERIAL
+from dexsim_real.twin.wire.firmware import SERIALS
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
@@ -75,9 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = Path(folder) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
-        save_calibration(
-            calibration, dataclasses.replace(ideal_calibration(hand), serial=SERIAL, handedness=HANDEDNESS)
-        )
+        known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
+        save_calibration(calibration, known)
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()
         try:

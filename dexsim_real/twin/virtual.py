@@ -183,7 +183,7 @@ class VirtualRun:
         *,
         safety: bool = True,
     ):
-        trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task)
+        trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task, plant.hand.thumb_side)
         if np.abs(trained - mounted).max() > 0.01:
             raise HandError(
                 f"the policy was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm frame, the "

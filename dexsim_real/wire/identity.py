@@ -45,9 +45,8 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     `identity` is None if the port cannot tell it. Raises HandError: it is another hand.
     """
     serial, side = (identity.serial_number, identity.handedness.lower()) if identity else ("", "")
-    model = next((name for name in ("left", "right") if name in hand.name), "")
-    if model and side in ("left", "right") and side != model:
-        raise HandError(f"this is a {side} hand (serial number {serial}), the model a {model} one")
+    if side in ("left", "right") and side != hand.side:
+        raise HandError(f"this is a {side} hand (serial number {serial}), the model a {hand.side} one: see --hand")
     expected = calibration.serial if calibration else ""
     if expected and not serial:
         raise HandError(

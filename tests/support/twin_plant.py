@@ -1,6 +1,7 @@
 """Physics simple enough to see through, for the emulated hand's wire: every joint follows its command with a lag."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ class ScriptedPlant:
       turn: rad/s of the object.
     """
 
+    hand = SimpleNamespace(side="right")
     up = np.array([math.cos(0.2), 0.0, math.sin(0.2)])
     shape = ObjectShape("box", (Primitive("box", (0.025, 0.025, 0.025)),))
 

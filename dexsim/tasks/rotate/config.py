@@ -7,6 +7,8 @@ from dexsim.control import Control
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.mirror import mirror_point
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.task_spec import TurnSpec
@@ -44,7 +46,7 @@ class RotateReward(Config):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RotateConfig(EnvConfig):
-    """The rotation task."""
+    """The rotation task, as a right hand does it; a left hand does the mirror image."""
 
     objects: ObjectConfig = setting(
         ObjectConfig(
@@ -112,6 +114,19 @@ class RotateConfig(EnvConfig):
         super().__post_init__()
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
+
+    def placed_on(self, hand: Hand) -> "RotateConfig":
+        """These settings in the palm frame of this hand."""
+        if hand.side == "right":
+            return self
+        across, along = self.start_offset
+        return dataclasses.replace(
+            self,
+            roll=-self.roll,
+            reference=mirror_point(self.reference),
+            start_offset=(-across, along),
+            turn=self.turn.mirror(),
+        )
 
 
 def paper() -> RotateConfig:

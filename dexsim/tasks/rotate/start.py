@@ -163,6 +163,7 @@ def _trap_candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: An
     )
     low, high = jnp.array([0.0, -0.025, 0.0]), jnp.array([0.03, 0.0, 0.015])
     shift = jax.random.uniform(keys[5], (3,), minval=low, maxval=high)
+    shift = shift * jnp.array([1.0, hand.thumb_side, 1.0])
     place = jnp.asarray(config.reference) + shift + jnp.array([0.0, 0.0, _TRAP_PLACE])
     return _at(hand, object, joints, target, place, quat)
 

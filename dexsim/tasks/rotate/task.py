@@ -21,6 +21,7 @@ from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand
+from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
 from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
@@ -115,33 +116,36 @@ class Rotate(Task):
     config: RotateConfig
 
     def __init__(self, config: RotateConfig, hand: Hand):
-        posture, reference = config.posture or hand.rotate_posture, config.reference or hand.rotate_reference
+        own = mirror_point(hand.rotate_reference) if hand.side == "left" else hand.rotate_reference
+        posture, reference = config.posture or hand.rotate_posture, config.reference or own
         if not (posture and reference):
             raise ConfigError(f"hand {hand.name!r} has no rotate: its TOML needs [rotate] with posture and reference")
         config = dataclasses.replace(config, posture=posture, reference=reference)
-        self.config, self.hand, self.posture, self.turn = config, hand, posture, config.turn
+        self.config, self.hand, self.posture = config, hand, posture
+        self._placed = placed = config.placed_on(hand)
+        self.turn = placed.turn
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in PROPERTY_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
-        self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
-        (x, y, z), self._palm = reference, palm_height(hand)
+        self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
+        (x, y, z), self._palm = placed.reference, palm_height(hand)
         self.reference = (x, y, z)
-        self._axis = jnp.asarray(config.turn.unit_axis)
-        self._step, self._sense = config.turn.step, math.copysign(1.0, config.turn.step)
+        self._axis = jnp.asarray(self.turn.unit_axis)
+        self._step, self._sense = self.turn.step, math.copysign(1.0, self.turn.step)
         self._period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
         self.evaluation_ticks = max(round(config.evaluation_seconds / self._period), 1)
 
     def make_pool(self, key: jax.Array) -> Start:
         """Objects that came to rest in random postures of the hand; see `dexsim.tasks.rotate.start`."""
-        return load_pool(key, self.hand, self.config, self.gravity)
+        return load_pool(key, self.hand, self._placed, self.gravity)
 
     def sample_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`; there is only one kind."""
         del shape_index
-        return sample_turned_object(key, config)
+        return sample_turned_object(key, config.placed_on(self.hand))
 
     def unit_inertia(self, object: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""

@@ -38,23 +38,31 @@ _HAND_OVER = 0.5  # s of holding before release, for a runner that continues aft
 _PLACES = 60  # sampled for an object
 
 
-def nominal_gravity(task: str) -> np.ndarray:
-    """Gravity [3] m/s^2 in the palm frame: upside down to grasp, palm up on a leaning mount to rotate."""
+def nominal_gravity(task: str, thumb_side: float = 1.0) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame: upside down to grasp, palm up on a leaning mount to rotate.
+
+    `thumb_side` is the hand's (`Hand.thumb_side`), here and below.
+    """
     if task == "grasp":
         return GRAVITY * np.array([1.0, 0.0, 0.0])
     pitch, roll = MOUNT
-    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), thumb_side * np.sin(roll), -np.sin(pitch) * np.cos(roll)])
 
 
-def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
+def tilted_gravity(task: str, tilt: np.ndarray, thumb_side: float = 1.0) -> np.ndarray:
     """Gravity [3] m/s^2 in the palm frame of a hand tilted by angles [2] rad about two horizontal axes."""
-    down = nominal_gravity(task)
+    down = nominal_gravity(task, thumb_side)
     way = down / GRAVITY
     side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made horizontal
     side = side / np.linalg.norm(side)
     for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
         down = matrix(turn(axis, float(angle))) @ down
     return down
+
+
+def place_along_palm(task: str, thumb_side: float) -> np.ndarray:
+    """Where [2] m along the palm (y, z) the object is placed."""
+    return np.array(PLACES[task]) * (thumb_side, 1.0)
 
 
 class Place(NamedTuple):
@@ -70,7 +78,9 @@ class Place(NamedTuple):
         return self.position + _SHELF
 
 
-def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float) -> Place:
+def sample_place(
+    parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, thumb_side: float
+) -> Place:
     """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
     if parameters.task == "rotate":
         quat = turn((1.0, 0.0, 0.0), parameters.heading_error * rng.uniform(-1, 1))
@@ -85,18 +95,23 @@ def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random
         shift = 0.01 * rng.uniform(-1, 1, 2)
         gap, speed = parameters.gap, parameters.release_speed
     up = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([face + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
+    position = np.array([face + gap + shape.reach(up), *(place_along_palm(parameters.task, thumb_side) + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
 def find_place(
-    scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float
+    scene: Scene,
+    parameters: TrialParameters,
+    shape: ObjectShape,
+    rng: np.random.Generator,
+    face: float,
+    thumb_side: float,
 ) -> Place | None:
     """Sample a release pose that the hand in its start posture leaves clear; None if there seems to be none."""
     data = mujoco.MjData(scene.model)
     data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
     for _ in range(_PLACES):
-        place = sample_place(parameters, shape, rng, face)
+        place = sample_place(parameters, shape, rng, face, thumb_side)
         if clear(scene, data, place):
             return place
     return None

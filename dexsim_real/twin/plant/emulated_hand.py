@@ -15,7 +15,16 @@ import numpy as np
 
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.assistant import GRAVITY, PLACES, Assistant, Stage, clear, find_place, put, tilted_gravity
+from dexsim_real.twin.plant.assistant import (
+    GRAVITY,
+    Assistant,
+    Stage,
+    clear,
+    find_place,
+    place_along_palm,
+    put,
+    tilted_gravity,
+)
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.hand_model import own_model, read_model
 from dexsim_real.twin.plant.parameters import (
@@ -209,8 +218,9 @@ class EmulatedHand:
             parameters = sample_trial(self.task, rng, self.kind, self._overrides)
             shape = sample_shape(parameters, rng, self._shape)
             scene = self._draw(parameters, shape)
-            self._palm_face = palm_face(scene, PLACES[self.task]) if self._model.foreign else PALM_FACE
-            place = find_place(scene, parameters, shape, rng, self._palm_face)
+            where, side = place_along_palm(self.task, self.hand.thumb_side), self.hand.thumb_side
+            self._palm_face = palm_face(scene, where) if self._model.foreign else PALM_FACE
+            place = find_place(scene, parameters, shape, rng, self._palm_face, side)
             if place is not None:
                 break
         else:
@@ -218,7 +228,7 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
-        self._referee = Referee(self.task, self._seconds)
+        self._referee = Referee(self.task, self._seconds, self.hand.thumb_side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -226,7 +236,7 @@ class EmulatedHand:
     def _draw(self, parameters: TrialParameters, shape: ObjectShape) -> Scene:
         """The scene of another object, in which `_enter` begins."""
         self.parameters, self.shape = parameters, shape
-        self._gravity = tilted_gravity(self.task, parameters.gravity_tilt)
+        self._gravity = tilted_gravity(self.task, parameters.gravity_tilt, self.hand.thumb_side)
         return build_scene(self._model, parameters, shape, self._gravity)
 
     def _enter(self, scene: Scene, rng: np.random.Generator) -> None:

@@ -55,13 +55,14 @@ class Referee:
     Args:
       task: "grasp" or "rotate".
       seconds: time limit; None is that of the task.
+      thumb_side: the hand's; the goals of a left hand are those of its mirror image.
     """
 
-    def __init__(self, task: str, seconds: float | None = None):
+    def __init__(self, task: str, seconds: float | None = None, thumb_side: float = 1.0):
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
-        self._reference = np.array(REFERENCES[task])
+        self._reference, self._step = np.array(REFERENCES[task]) * (1.0, thumb_side, 1.0), thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
         self._force, self._duty, self._speed = np.zeros(5), np.zeros(5), 0.0
@@ -149,7 +150,7 @@ class Referee:
         if self._heading is None:  # Angle of the rotation about x nearest to the orientation.
             self._heading = 2 * math.atan2(quat[1], quat[0])
         for name, fastest in _FASTEST.items():
-            goal = turn(_AXIS, self._heading + (self.goals[name] + 1) * GOAL_STEP)
+            goal = turn(_AXIS, self._heading + (self.goals[name] + 1) * self._step)
             apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
             self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= fastest
 

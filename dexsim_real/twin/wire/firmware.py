@@ -18,10 +18,10 @@ from dexsim_real.wire.serial_hand import passive_command
 
 OVERHEATED, ABANDONED = 1, 4
 """Error bits of a joint, defined by this board: too hot and off, no host."""
-VERSION, SERIAL, HANDEDNESS = "1.3.9 emulated", "2R32EMULATED", "right"
+VERSION = "1.3.9 emulated"
+SERIALS = {"right": "2R32EMULATED", "left": "2L32EMULATED"}
 FORCE_PER_COUNT = 0.1  # N of one taxel count
 SHUTDOWN = 95.0  # degC at which a motor goes off until it is 10 K cooler
-_REGISTERS = {SERIAL_NUMBER.to_bytes(2, "little"): SERIAL, SIDE.to_bytes(2, "little"): HANDEDNESS}
 _PALM, _TIP = 38, 31  # degC of palm board and fingertips
 _TICK = 2 * np.pi / 4096  # rad, resolution of the encoders
 _ID, _PARAMETER, _MODE, _FORCE_MODE = 1, 30, 67, 81  # numbers of refusals
@@ -44,6 +44,8 @@ class Firmware:
 
     def __init__(self, plant: EmulatedHand, watchdog: float = 0.0, note: Callable[[str], None] = lambda text: None):
         self.plant, self.watchdog, self._note = plant, watchdog, note
+        side = plant.hand.side
+        self._registers = {SERIAL_NUMBER.to_bytes(2, "little"): SERIALS[side], SIDE.to_bytes(2, "little"): side}
         self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = passive_command()  # `frames.COMMAND_BLOCK` that the joints execute
         self.faults: list[tuple[float, Fault]] = []  # that last now, and until when (s)
@@ -92,8 +94,8 @@ class Firmware:
                 data = self._exchange(frame.data, now)
             elif asked == Command.VERSION:
                 data = VERSION.encode()
-            elif asked == Command.READ_REGISTER and frame.data[:2] in _REGISTERS:
-                data = frame.data[:2] + _REGISTERS[frame.data[:2]].encode().ljust(32, b"\0")
+            elif asked == Command.READ_REGISTER and frame.data[:2] in self._registers:
+                data = frame.data[:2] + self._registers[frame.data[:2]].encode().ljust(32, b"\0")
             else:
                 raise _Refusal(_PARAMETER)
             self.counts[asked.name.lower()] += 1

@@ -117,6 +117,17 @@ def test_a_calibration_of_another_hand_is_refused_before_anything_moves(hand, tm
         assert not peer.on().any()
 
 
+def test_a_left_hand_runs_the_policy_of_the_right_one_and_a_right_hand_is_refused(tmp_path):
+    with FollowingHand() as peer:
+        options = ("--hand", "xhand_left", "--motors-off", "--seconds", "0.5")
+        with pytest.raises(HandError, match="this is a right hand .* the model a left one"):
+            run.main(arguments(peer, tmp_path / "refused", *options))
+        peer.registers = {20: b"left", 21: b"2L32SCRIPTED"}
+        assert run.main(arguments(peer, tmp_path, *options)) == 0
+    again = replay.replay(tmp_path / "run.log")
+    assert again.hand.name == "xhand_left" and again.report["first_difference"] is None
+
+
 @pytest.mark.parametrize(("rate", "watchdog"), [(5.0, 0.5), (20.0, 0.3)])
 def test_a_target_stays_good_for_two_and_a_half_ticks_of_its_policy(hand, rate, watchdog):
     """At 5 Hz every second cycle would hold otherwise. Where the setting is longer, the setting counts."""

@@ -20,7 +20,7 @@ from dexsim.calibration.maps import load_calibration
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
 from dexsim_real.twin.server import PlantClock
-from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, HANDEDNESS, SERIAL
+from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, SERIALS
 
 
 def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot():
@@ -81,7 +81,7 @@ def test_it_offers_a_calibration_of_this_hand_and_ends_in_good_order_when_it_is_
     shown = waiting.stdout.readline().decode()
     calibration = load_calibration(shown.split("--calibration ")[1].split()[0], hand)
     np.testing.assert_allclose(calibration.force_per_count, FORCE_PER_COUNT)
-    assert (calibration.serial, calibration.handedness) == (SERIAL, HANDEDNESS)
+    assert (calibration.serial, calibration.handedness) == (SERIALS["right"], "right")
     waiting.send_signal(signal.SIGTERM)
     assert waiting.wait(10) == 0 and (tmp_path / "out.json").exists() and not (tmp_path / "port").is_symlink()
     waiting.communicate()

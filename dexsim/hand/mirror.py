@@ -1,0 +1,259 @@
+"""The mirror image of a hand: a right one becomes a left one, and the other way round.
+
+    dexsim mirror-hand my_right.toml --out my_left
+
+The palm's frame and every link's are reflected in their planes y = 0. Joint axes are axial vectors: the same angle
+turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
+"""
+
+import csv
+import dataclasses
+import functools
+import io
+import re
+import shutil
+import tomllib
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Annotated, TypeVar, cast
+from xml.etree import ElementTree
+
+import numpy as np
+import tyro
+
+from dexsim.core import cli
+from dexsim.core.errors import AssetError
+from dexsim.core.files import write_atomic
+from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR
+from dexsim.hand.files import find_hand
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+
+OTHER = {"right": "left", "left": "right"}
+Point = TypeVar("Point", bound=tuple[float, ...])
+_SIGNS: dict[str, tuple[int, ...]] = {
+    "pos": (1,),
+    "dir": (1,),
+    "zaxis": (1,),
+    "fromto": (1, 4),
+    "gravity": (1,),
+    "quat": (1, 3),
+    "axis": (0, 2),
+    "axisangle": (0, 2),
+    "xyaxes": (1, 3, 5),  # y' = z' x x': its sign is the opposite of a polar vector's
+    "fullinertia": (3, 5),  # xy and yz of xx, yy, zz, xy, xz, yz
+}
+"""Numbers of an MJCF's attributes that change sign."""
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+_SAME = 1e-4  # m, between a lattice and its mirror image that are one part
+
+
+@functools.cache
+def mirror_hand(hand: Hand) -> Hand:
+    """The mirror image of a hand's description. `model_path` and names stay: files are mirrored by `write_mirror`."""
+    geoms = tuple(
+        dataclasses.replace(geom, position=geom.position * POLAR, rotation=geom.rotation * MATRIX)
+        for geom in hand.geoms
+    )
+    return dataclasses.replace(
+        hand,
+        side=OTHER[hand.side],
+        body_position=hand.body_position * POLAR,
+        body_rotation=hand.body_rotation * MATRIX,
+        joint_axis=np.where(hand.body_joint[:, None] >= 0, hand.joint_axis * AXIAL, hand.joint_axis),
+        joint_anchor=hand.joint_anchor * POLAR,
+        tip_offset=hand.tip_offset * POLAR,
+        taxel_position=hand.taxel_position * POLAR,
+        taxel_normal=hand.taxel_normal * POLAR,
+        geoms=geoms,
+        grasp_centre=mirror_point(hand.grasp_centre),
+        rotate_reference=mirror_point(hand.rotate_reference),
+    )
+
+
+def mirror_point(point: Point) -> Point:
+    """The mirror image of a position [3] m; of an empty one itself."""
+    return cast(Point, tuple(-value if axis == 1 else value for axis, value in enumerate(point)))
+
+
+def is_mirror_image(hand: Hand, other: Hand) -> bool:
+    """Whether two hands are each other's mirror image in what a policy moves and observes, names of sides aside."""
+    image = mirror_hand(other)
+    parts = ("body_position", "body_rotation", "joint_axis", "joint_anchor", "tip_offset", "joint_lower", "joint_upper")
+    return (
+        hand.side == image.side
+        and hand.joint_names == tuple(swap_sides(name) for name in other.joint_names)
+        and all(np.array_equal(getattr(hand, name), getattr(image, name)) for name in parts)
+    )
+
+
+def swap_sides(text: str) -> str:
+    """A text with its words right and left exchanged; "_" and digits end a word."""
+
+    def other(word: re.Match) -> str:
+        swapped = OTHER[word[0].lower()]
+        return swapped.upper() if word[0].isupper() else swapped.title() if word[0][0].isupper() else swapped
+
+    return re.sub(r"(?<![a-z])(right|left)(?![a-z])", other, text, flags=re.IGNORECASE)
+
+
+def mirror_name(name: str, side: str) -> str:
+    """The name of a mirror image that is a hand of this side."""
+    swapped = swap_sides(name)
+    return swapped if swapped != name else f"{name}_{side}"
+
+
+def mirror_toml(text: str, stem: str) -> str:
+    """The mirror image's TOML, whose files are `stem`.xml and `stem`_taxels.csv."""
+    table = tomllib.loads(text)
+    text = re.sub(r"^[^#\n]+", lambda match: swap_sides(match[0]), text, flags=re.MULTILINE)  # comments stay
+    # Of positions [3], the second number. Other entries are names, or the same for either hand.
+    second = r"(\b(?:centre|reference|facing)\s*=\s*\[[^],]*,\s*)([^],]*)"
+    text = re.sub(second, lambda match: match[1] + _negate(match[2]), text)
+    text = re.sub(r'^(model\s*=\s*)"[^"]*"', rf'\1"{stem}.xml"', text, flags=re.MULTILINE)
+    text = re.sub(r'^(taxels\s*=\s*)"[^"]*"', rf'\1"{stem}_taxels.csv"', text, flags=re.MULTILINE)
+    if "name" in table:  # the first of that name; the others are fingers'
+        text = re.sub(r'^name\s*=\s*"[^"]*"', f'name = "{stem}"', text, count=1, flags=re.MULTILINE)
+    if "side" in table:  # swapped above
+        return text
+    return re.sub(r"^(?=[^#\s])", 'side = "left"\n', text, count=1, flags=re.MULTILINE)
+
+
+def mirror_mjcf(model: ElementTree.Element) -> None:
+    """Mirror an MJCF without includes, in place."""
+    order = next((c.get("eulerseq") for c in model.iter("compiler") if c.get("eulerseq")), "xyz")
+    signs = _SIGNS | {"euler": tuple(i for i, axis in enumerate(order.lower()) if axis != "y")}
+    first = model.find("default")
+    if first is None:
+        first = ElementTree.Element("default")
+        model.insert(0, first)
+    # MuJoCo's own defaults, which files need not state.
+    for tag, name, value in (("joint", "axis", "0 0 1"), ("mesh", "scale", "1 1 1")):
+        if model.find(f".//{tag}") is not None:
+            default = first.find(tag)
+            if default is None:
+                default = ElementTree.SubElement(first, tag)
+            default.attrib.setdefault(name, value)
+    for element in model.iter():
+        for name, value in element.attrib.items():
+            which = (1,) if (element.tag, name) == ("mesh", "scale") else signs.get(name)
+            if which:
+                numbers = value.split()
+                value = " ".join(_negate(n) if i in which else n for i, n in enumerate(numbers))
+            elif name not in ("file", *_FOLDERS):
+                value = swap_sides(value)
+            element.set(name, value)
+
+
+def mirror_taxels(text: str) -> str:
+    """The mirror image's table of taxels (`dexsim.hand.layout`).
+
+    A lattice that is its own mirror image stays as it is, index by index: it is the same part on either hand, and its
+    columns run the same way round the finger.
+    """
+    head, *rows = csv.reader(io.StringIO(text))
+    y, normal_y, at = head.index("y"), head.index("ny"), [head.index(name) for name in "xyz"]
+    mirrored = []
+    for _, group in groupby(rows, key=lambda row: row[head.index("finger")]):
+        taxels = list(group)
+        place = np.array([[float(row[i]) for i in at] for row in taxels])
+        apart = np.abs(place[:, None] - place * POLAR).max(-1).min(1)
+        if apart.max() > _SAME:
+            for row in taxels:
+                row[y], row[normal_y] = _negate(row[y]), _negate(row[normal_y])
+        mirrored += taxels
+    table = io.StringIO()
+    csv.writer(table, lineterminator="\n").writerows([head, *mirrored])
+    return table.getvalue()
+
+
+def write_mirror(path: Path, folder: Path) -> Path:
+    """Write the files of a hand's mirror image, its meshes included; the path of the new TOML.
+
+    Args:
+      path: the hand's TOML.
+      folder: must not have a TOML of the new name.
+
+    Raises:
+      AssetError: a file of the hand is missing or broken, or the new one exists.
+    """
+    hand = load_hand(path)
+    stem = mirror_name(path.stem, OTHER[hand.side])
+    toml = folder / f"{stem}.toml"
+    if toml.exists():
+        raise AssetError(f"{toml}: exists; give another folder with --out")
+    text = path.read_text()
+    model = ElementTree.parse(hand.model_path).getroot()
+    _paste_includes(model, hand.model_path.parent, hand.model_path.parent)
+    files = dict(_gather_files(model, hand.model_path.parent))
+    mirror_mjcf(model)
+    comment = f" Mirror image of {hand.model_path.name} in the plane y = 0, by `dexsim mirror-hand`. "
+    model.insert(0, ElementTree.Comment(comment))
+    ElementTree.indent(model)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, source in files.items():
+        shutil.copyfile(source, folder / name)
+    write_atomic(folder / f"{stem}.xml", [ElementTree.tostring(model) + b"\n"])
+    if taxels := tomllib.loads(text).get("taxels"):
+        write_atomic(folder / f"{stem}_taxels.csv", [mirror_taxels((path.parent / taxels).read_text()).encode()])
+    write_atomic(toml, [mirror_toml(text, stem).encode()])
+    return toml
+
+
+def _negate(number: str) -> str:
+    """The digits of a file with the other sign, so that mirroring twice gives the same number."""
+    number = number.strip()
+    return number if float(number) == 0 else number[1:] if number.startswith("-") else f"-{number.lstrip('+')}"
+
+
+def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
+    """Put the content of included files in their place. MuJoCo looks beside the model first, in `top`."""
+    children = []
+    for child in list(element):
+        if child.tag != "include":
+            _paste_includes(child, top, folder)
+            children.append(child)
+            continue
+        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
+        included = ElementTree.parse(file).getroot()
+        _paste_includes(included, top, file.parent)
+        children += included
+    element[:] = children
+
+
+def _gather_files(model: ElementTree.Element, folder: Path) -> Iterator[tuple[str, Path]]:
+    """Let the MJCF look for its meshes and textures beside itself; yields their names there, and where they are."""
+    places: dict[str, str] = {}
+    for compiler in model.iter("compiler"):
+        places |= {name: compiler.attrib.pop(name) for name in _FOLDERS if name in compiler.attrib}
+    for element in model.iter():
+        if not (file := element.get("file")):
+            continue
+        element.attrib.setdefault("name", Path(file).stem)
+        place = places.get("meshdir" if element.tag == "mesh" else "texturedir", places.get("assetdir", ""))
+        name = "_".join(part for part in Path(file).parts if part not in ("..", "/"))
+        element.set("file", name)
+        yield name, folder / place / file
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MirrorHandArguments:
+    """Options of `dexsim mirror-hand`."""
+
+    hand: Annotated[Path, tyro.conf.Positional]
+    """The TOML of a hand, or the name of a shipped one."""
+    out: Path
+    """Folder for the files of the mirror image."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code, 0."""
+    description = "Write the mirror image of a hand: a left one of a right one, or the other way round."
+    arguments = cli.parse(MirrorHandArguments, argv, prog="dexsim mirror-hand", description=description)
+    print(write_mirror(find_hand(arguments.hand), arguments.out))
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,222 @@
+"""The mirror image of a hand: its files, its kinematics, and what a policy sees of it."""
+
+import dataclasses
+import shutil
+from xml.etree import ElementTree
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError
+from dexsim.geometry import rotations
+from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR, QUAT
+from dexsim.hand import mirror
+from dexsim.hand.files import find_hand
+from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.load import load_hand
+from dexsim.hand.mirror import is_mirror_image, main, mirror_hand, mirror_mjcf, swap_sides, write_mirror
+from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, Readings, mirror_readings, observe
+
+HANDS = ("xhand_right", "leap_like", "inspire_like")
+
+
+@pytest.fixture(scope="module")
+def left():
+    return load_hand("xhand_left")
+
+
+def same(one: Hand, other: Hand, *apart: str) -> None:
+    """Whether two hands agree in all that is a number."""
+    for field in dataclasses.fields(Hand):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, np.ndarray) and field.name not in apart:
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+    assert (one.side, one.grasp_centre, one.rotate_reference) == (
+        other.side,
+        other.grasp_centre,
+        other.rotate_reference,
+    )
+    for a, b in zip(one.geoms, other.geoms, strict=True):
+        for name in ("size", "position", "rotation"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-7)
+
+
+def test_the_shipped_left_hand_is_what_the_command_writes(tmp_path, capsys):
+    assert main(["xhand_right", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "xhand_left.toml")
+    shipped = asset_path("hand/xhand_left")
+    assert sorted(path.name for path in shipped.iterdir()) == sorted(path.name for path in tmp_path.iterdir())
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (shipped / path.name).read_bytes(), path.name
+
+
+def test_the_left_xhand_is_the_makers(left):
+    """Origins, axes and taxels of the public description of the left hand (URDF 1.3, T16 and T30 layouts)."""
+    where = {name.removeprefix("left_hand_"): body for body, name in enumerate(left.body_names)}
+    for name, origin, axis in (
+        ("thumb_bend_link", (0.0095, -0.0228, 0.0305), (0, 0, 1)),
+        ("thumb_rota_link1", (0.0083177, -0.028599, -0.00178), (-1, 0, 0)),
+        ("thumb_rota_link2", (0, -0.0553, 0), (-1, 0, 0)),
+        ("index_bend_link", (0.0065, -0.0265, 0.0899), (1, 0, 0)),
+        ("index_rota_link1", (0, 0, 0.0178), (0, 1, 0)),
+    ):
+        np.testing.assert_allclose(left.body_position[where[name]], origin, atol=1e-7)
+        np.testing.assert_array_equal(left.joint_axis[where[name]], axis)
+    # The thumb's sensor is a part of its own for either hand; the other fingers have the right hand's.
+    np.testing.assert_allclose(left.taxel_position[0, 0, :2], (-0.01488, -0.01984), atol=1e-7)
+    np.testing.assert_allclose(left.taxel_position[1, 0], (0.0004, -0.00832, 0.01809), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_mirror_image_moves_in_the_mirror_and_mirrored_twice_is_the_hand(tmp_path, name):
+    hand = load_hand(name)
+    image = load_hand(write_mirror(find_hand(name), tmp_path))
+    assert (image.side, image.name) == ("left", "xhand_left" if name == "xhand_right" else f"{name}_left")
+    # Taxels of a symmetric lattice keep their order, in which those of `mirror_hand` are reversed.
+    same(mirror_hand(hand), image, "taxel_position", "taxel_normal", "taxel_area")
+    for finger in range(hand.num_fingers):
+        mirrored = np.concatenate([hand.taxel_position[finger] * POLAR, hand.taxel_normal[finger] * POLAR], -1)
+        there = np.concatenate([image.taxel_position[finger], image.taxel_normal[finger]], -1)
+        assert np.abs(mirrored[:, None] - there).max(-1).min(1).max() < 1e-5
+    posture = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper).astype(np.float32)
+    pose, mirrored = forward_kinematics(hand, posture), forward_kinematics(image, posture)
+    np.testing.assert_allclose(mirrored.tip_position, np.asarray(pose.tip_position) * POLAR, atol=1e-6)
+    np.testing.assert_allclose(mirrored.body_rotation, np.asarray(pose.body_rotation) * MATRIX, atol=1e-6)
+    again = load_hand(write_mirror(tmp_path / f"{image.name}.toml", tmp_path / "again"))
+    same(again, hand)
+    same(mirror_hand(mirror_hand(hand)), hand)
+    assert is_mirror_image(image, hand) and is_mirror_image(hand, image) and not is_mirror_image(hand, hand)
+
+
+MODEL = """
+<mujoco model="right_parts">
+  <compiler meshdir="../meshes" eulerseq="zYx"/>
+  <include file="parts/defaults.xml"/>
+  <asset><mesh file="right_Wedge.obj"/></asset>
+  <worldbody>
+    <light pos="1 2 3" dir="0.1 0.2 -1"/>
+    <body name="right_palm" pos="0.01 0.02 0.03" euler="20 -30 40">
+      <frame pos="0 0.01 0" axisangle="1 2 3 25">
+        <body name="Right_thumb" xyaxes="1 0.2 0 -0.1 1 0.3">
+          <joint name="a" class="bent" pos="0.001 0.002 0.003"/>
+          <inertial pos="0.01 0.02 0.03" mass="0.1" fullinertia="3e-5 4e-5 5e-5 1e-6 2e-6 -3e-6"/>
+          <geom name="wedge" type="mesh" mesh="right_Wedge" quat="0.9 0.1 0.2 -0.3" pos="0 0.02 0"/>
+          <geom type="capsule" fromto="0 0 0 0.01 0.03 0.02" size="0.01"/>
+          <body name="tip" pos="0.01 0.02 0.05">
+            <joint name="b"/>
+            <geom type="box" size="0.01 0.02 0.03" zaxis="0.3 0.4 1"/>
+            <site name="right_tip" pos="0 0.004 0.03"/>
+          </body>
+        </body>
+      </frame>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_every_way_to_write_an_mjcf_is_mirrored(tmp_path):
+    """Orientations, frames, defaults, an included file and a mesh: masses, inertias and poses in C MuJoCo."""
+    folder = tmp_path / "model"
+    (folder / "parts").mkdir(parents=True)
+    (tmp_path / "meshes").mkdir()
+    (folder / "right.xml").write_text(MODEL)
+    (folder / "parts/defaults.xml").write_text(
+        '<mujoco><default><default class="bent"><joint axis="0.2 1 0.3"/></default></default></mujoco>'
+    )
+    (tmp_path / "meshes/right_Wedge.obj").write_text(
+        "v 0 0 0\nv .03 0 0\nv 0 .02 0\nv 0 .01 .04\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
+    model = ElementTree.parse(folder / "right.xml").getroot()
+    mirror._paste_includes(model, folder, folder)
+    for name, source in dict(mirror._gather_files(model, folder)).items():
+        shutil.copyfile(source, tmp_path / name)
+    mirror_mjcf(model)
+    (tmp_path / "left.xml").write_bytes(ElementTree.tostring(model))
+    one, other = (mujoco.MjModel.from_xml_path(str(p)) for p in (folder / "right.xml", tmp_path / "left.xml"))
+    np.testing.assert_allclose(other.body_mass, one.body_mass, rtol=1e-9)
+    np.testing.assert_allclose(other.body_inertia, one.body_inertia, rtol=1e-6)
+    here, there = mujoco.MjData(one), mujoco.MjData(other)
+    here.qpos[:] = there.qpos[:] = 0.7, -0.4
+    for data, model in ((here, one), (there, other)):
+        mujoco.mj_forward(model, data)
+    for name in ("xpos", "xipos", "geom_xpos", "site_xpos", "light_xpos", "light_xdir"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name) * POLAR, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(there.xaxis, here.xaxis * AXIAL, atol=1e-9)
+    np.testing.assert_allclose(there.xmat.reshape(-1, 3, 3), here.xmat.reshape(-1, 3, 3) * MATRIX, atol=1e-9)
+    np.testing.assert_allclose(there.qfrc_bias, here.qfrc_bias, atol=1e-9)  # gravity has no y
+    assert other.body("left_palm").id and other.body("Left_thumb").id and other.site("left_tip").id == 0
+
+
+def test_names_of_sides_are_words():
+    assert swap_sides("right_hand Left RIGHT bright right2 left") == "left_hand Right LEFT bright left2 right"
+
+
+def test_an_existing_hand_is_not_overwritten(tmp_path):
+    write_mirror(find_hand(None), tmp_path)
+    with pytest.raises(AssetError, match="xhand_left.toml: exists; give another folder"):
+        write_mirror(find_hand(None), tmp_path)
+
+
+NUMBERS = st.lists(st.floats(-1, 1, width=32), min_size=20, max_size=20)
+
+
+def readings_of(hand: Hand, numbers: list[float]) -> Readings:
+    """Readings with these numbers in them."""
+    values = np.array(numbers, np.float32)
+    quats = values[:8].reshape(2, 4) + np.array([1.5, 0, 0, 0], np.float32)
+    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
+    taxels = np.maximum(np.resize(values, hand.taxel_area.shape), 0).astype(np.float32)
+    joints = np.resize(values, hand.num_joints).astype(np.float32)
+    return Readings(
+        joint_position=(hand.joint_lower + hand.joint_upper) / 2 + 0.1 * joints,
+        joint_torque=joints,
+        taxel_force=taxels,
+        object_position=values[8:11],
+        object_velocity=values[11:14],
+        object_quat=quats[0],
+        goal_quat=quats[1],
+        command=np.float32(0.5),
+        last_action=joints,
+        past_actions=np.stack([joints, -joints]),
+        palm_gravity=values[14:17],
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(NUMBERS)
+def test_readings_are_mirrored_as_rotations_and_vectors_are(hand, numbers):
+    readings = readings_of(hand, numbers)
+    image = mirror_readings(readings)
+    for name, value in vars(mirror_readings(image)).items():
+        np.testing.assert_array_equal(value, getattr(readings, name), err_msg=name)
+    turned = rotations.rotate(rotations.quat_to_matrix(jnp.asarray(readings.object_quat)), readings.palm_gravity)
+    again = rotations.rotate(rotations.quat_to_matrix(jnp.asarray(image.object_quat)), image.palm_gravity)
+    np.testing.assert_allclose(again, turned * POLAR, atol=1e-6)
+    relative = rotations.quat_multiply(readings.goal_quat, rotations.quat_conjugate(readings.object_quat))
+    mirrored = rotations.quat_multiply(image.goal_quat, rotations.quat_conjugate(image.object_quat))
+    np.testing.assert_allclose(mirrored, relative * QUAT, atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [GRASP, (*ROTATE_CRITIC, "palm_gravity", "past_actions", "finger_force")])
+def test_a_policy_sees_the_right_hand(hand, left, names):
+    """The left hand's own readings: taxels in its own order."""
+    readings = readings_of(hand, list(np.random.default_rng(1).uniform(-1, 1, 20)))
+    motion = Motion(readings.joint_torque, readings.object_velocity)
+    order = [
+        np.abs(p[:, None] - q * POLAR).max(-1).argmin(0)
+        for p, q in zip(hand.taxel_position, left.taxel_position, strict=True)
+    ]
+    its_own = mirror_readings(
+        dataclasses.replace(
+            readings, taxel_force=np.stack([f[o] for f, o in zip(readings.taxel_force, order, strict=True)])
+        )
+    )
+    config = ObservationConfig()
+    seen = observe(left, its_own, names, config, Motion(motion.joint_velocity, motion.object_spin * AXIAL))
+    np.testing.assert_allclose(seen, observe(hand, readings, names, config, motion), atol=2e-5)

@@ -1,0 +1,65 @@
+"""The left hand on the bridge: shipped policies of the right one on an emulated left hand, in virtual time."""
+
+import numpy as np
+import pytest
+
+from dexsim.hand.load import load_hand
+from dexsim_ppo.policy import load_policy
+from dexsim_real.calibrate.plan import placements
+from dexsim_real.control.controller import Controller
+from dexsim_real.core.errors import HandError
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.wire.frames import HOST, Command, Frame, palm_address
+from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, check_identity, read_identity
+
+
+@pytest.fixture(scope="module")
+def left():
+    return load_hand("xhand_left")
+
+
+def run(hand, name, seconds):
+    controller = Controller(load_policy(name), hand)
+    plant = EmulatedHand(hand, name, 0, kind="nominal", trials=1, seconds=seconds)
+    return VirtualRun(plant, controller, ideal_calibration(hand))
+
+
+def test_the_shipped_grasp_holds_on_the_left_hand(left):
+    report = run(left, "grasp", 3.0).run()
+    assert report["held"] and report["finger_force"] > 0.5 and report["bridge"]["latched"] == ""
+
+
+@pytest.mark.slow
+def test_the_shipped_rotation_turns_the_other_way_on_the_left_hand(left):
+    trial = run(left, "rotate", 15.0)
+    heading = []
+    for _ in trial.ticking():
+        quat = trial.plant.true_pose()[2]
+        heading.append(2 * np.arctan2(quat[1], quat[0]))
+    turned = np.unwrap(heading)
+    report = trial.plant.results()[0]
+    assert report["successes"] >= 2 and turned[-1] - turned[0] < -2.0
+    assert trial.policy.goals.successes >= report["successes"] - 1
+
+
+def test_the_emulated_hand_tells_its_side_and_the_other_is_refused(hand, left):
+    told = {}
+    for one in (hand, left):
+        board = run(one, "grasp", 1.0).port.firmware
+        contents = []
+        for register in (SERIAL_NUMBER, SIDE):
+            ask = Frame(HOST, palm_address(0), Command.READ_REGISTER, register.to_bytes(2, "little"))
+            contents.append(board.answer(ask, 0.0).data[2:])
+        told[one.side] = read_identity(*contents)
+        assert check_identity(told[one.side], one) == []
+    for side, model in (("left", hand), ("right", left)):
+        with pytest.raises(HandError, match=f"this is a {side} hand .* the model a {model.side} one: see --hand"):
+            check_identity(told[side], model)
+
+
+def test_the_left_hand_is_calibrated_by_the_same_presses(hand, left):
+    for one, other in zip(placements(hand), placements(left), strict=True):
+        assert (one.name, one.joints, one.task) == (other.name, other.joints, other.task)
+        np.testing.assert_array_equal(other.posture, one.posture)
+        np.testing.assert_allclose(other.direction, one.direction, atol=1e-5)
