@@ -265,7 +265,9 @@ class EmulatedHand:
             "parameter_kind": self.kind,
             "plant": self._model.name,
             "shape": self.shape.name,
-            "parts": [dataclasses.asdict(part) for part in self.shape.parts],
+            "parts": [
+                {"kind": part.kind, "size": list(part.size), "place": list(part.place)} for part in self.shape.parts
+            ],
             "stage": self.stage.value,
             **self._referee.report(),
             "parameters": {name: np.round(value, 6).tolist() for name, value in values.items()},
