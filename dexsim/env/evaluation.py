@@ -6,7 +6,7 @@ episodes run side by side, and episodes are independent.
 """
 
 import itertools
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -41,8 +41,8 @@ class Evaluation:
     def evaluation_plan(self, count: int, seed: int) -> EvaluationPlan:
         """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own, with rows
         enough for them (host). Raises ConfigError: see `Task.make_pool`."""
-        task, key, pool = self.env.task, jax.random.key(seed), None
-        pool_key = jax.random.fold_in(key, _POOL)
+        task, key = self.env.task, jax.random.key(seed)
+        pool_key, pool = jax.random.fold_in(key, _POOL), cast(Any, None)
         for part in itertools.count():
             rows: Any = jax.tree.map(np.asarray, task.make_pool(jax.random.fold_in(pool_key, part)))
             pool = rows if pool is None else jax.tree.map(lambda *parts: np.concatenate(parts), pool, rows)
