@@ -95,7 +95,7 @@ def _side(hand: Hand, lines: Mapping[int, JointLines], where: str) -> Side:
             )
         rows.append({key: np.mean([measured[other][key] for other in mates], 0) for key in measured[mates[0]]})
         if joint not in measured:
-            rows[-1] |= {"samples": np.zeros(2), "outliers": np.zeros(2)}
+            rows[-1]["samples"] = np.zeros(2)
     return Side(**{key: np.stack([row[key] for row in rows], -1) for key in rows[0]})
 
 
@@ -103,9 +103,9 @@ def _row(lines: JointLines) -> dict[str, np.ndarray]:
     """The fields of `Side` for one joint; a missing line is the other one with 0 samples, off by the gear's losses."""
     only = lines.loading or lines.unloading
     assert only is not None, "`fit_joint` refuses a recording without a line"
-    stand_in = dataclasses.replace(only.widened(_LOSSES), samples=0, outliers=0)
+    stand_in = dataclasses.replace(only.widened(_LOSSES), samples=0)
     both = [lines.loading or stand_in, lines.unloading or stand_in]
-    names = ("gain", "offset", "noise", "r_squared", "condition", "samples", "outliers")
+    names = ("gain", "offset", "noise", "r_squared", "samples")
     row = {name: np.array([getattr(line, name) for line in both], float) for name in names}
     for name in ("gain", "offset"):
         interval = np.array([getattr(line, f"{name}_interval") for line in both])

@@ -8,15 +8,18 @@ so intervals count whole presses, not samples.
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import median_filter
+from scipy.signal import find_peaks
 
+from dexsim.calibration.line import LEAST_PRESSES, Line, fit_line
 from dexsim.core.errors import CalibrationError
-from dexsim.core.robust_line import LEAST_GROUPS, Line, fit_line
 
 MIN_SAMPLES = 20
 """Samples that each direction needs."""
 MIN_FORCE_RANGE = 0.5
 """N between the 5th and the 95th percentile of the force."""
 _LARGEST = {"A": 20.0, "Nm": 50.0, "N": 500.0}  # beyond these the unit must be another
+_SATURATED = 0.2  # share of the samples that may be at the maximum
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +56,9 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
     force, value = _checked(press, unit, where)
     direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
     number = find_presses(force) if press.press is None else np.asarray(press.press)
-    free = _not_saturated(force, where, "force") & _not_saturated(np.abs(value), where, "value")
     lines: list[Line | None] = []
     for sign, name in ((1, "loading"), (-1, "unloading")):
-        keep = free & (direction == sign)
+        keep = direction == sign
         enough = np.sum(keep) >= MIN_SAMPLES
         lines.append(_fit_direction(force[keep], value[keep], number[keep], f"{where}, {name}") if enough else None)
     fits = [line for line in lines if line is not None]
@@ -67,12 +69,9 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
             f"{where}: rises with force while loading, falls while unloading; check joint and finger names"
         )
     notes = _line_notes(lines, unit)
-    if clipped := int(np.sum(~free)):
-        notes.append(f"{clipped} saturated samples left out ({unit})")
-    if len(np.unique(number[free & (direction != 0)])) < LEAST_GROUPS:
-        notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ ({unit})")
-    # 4.685: where the bisquare's weight ends, beyond which a sample is an outlier.
-    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in fits], 0)
+    if len(np.unique(number[direction != 0])) < LEAST_PRESSES:
+        notes.append(f"fewer than {LEAST_PRESSES} presses: the intervals leave out how presses differ ({unit})")
+    sound = np.any([np.abs(value - line(force)) <= 5 * line.noise for line in fits], 0)
     friction = float("nan")
     if len(fits) == 2:
         middle = (np.min(force[sound]) + np.max(force[sound])) / 2
@@ -85,52 +84,30 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
 def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
     """1 while the force [T] rises, -1 while it falls, 0 just after a turn; in the order of time.
 
-    Turns are the extremes that stand out of the noise. In the first `trim` of each swing the gear's friction is on its
-    way from one side to the other.
+    In the first `trim` of each swing the gear's friction is on its way from one side to the other.
     """
-    smooth, turns, sign = _swings(force)
+    smooth, turns = _turns(force)
     direction = np.zeros(len(smooth), int)
     for first, last in zip(turns[:-1], turns[1:], strict=True):
-        swing = np.abs(smooth[first:last] - smooth[first])
-        reach = np.abs(smooth[last] - smooth[first])
-        direction[first:last] = np.where(swing >= trim * reach, sign, 0)
-        sign = -sign
+        swing, reach = smooth[first:last] - smooth[first], smooth[last] - smooth[first]
+        direction[first:last] = np.where(np.abs(swing) >= trim * np.abs(reach), np.sign(reach), 0)
     return direction
 
 
 def find_presses(force: np.ndarray) -> np.ndarray:
     """Number [T] of the press, up and down again, that each sample of a force [T] belongs to."""
-    _, turns, sign = _swings(force)
-    number = np.zeros(len(force), int)
-    for turn in turns[1 + (sign > 0) : -1 : 2]:  # A press begins where the force begins to rise.
-        number[turn:] += 1
-    return number
+    smooth, turns = _turns(force)
+    starts = [turn for turn, after in zip(turns[1:-1], turns[2:], strict=True) if smooth[after] > smooth[turn]]
+    return np.searchsorted(starts, np.arange(len(force)), side="right")
 
 
-def _swings(force: np.ndarray) -> tuple[np.ndarray, list[int], int]:
-    """The force [T] without noise, its turns, and the way of the first swing."""
-    from scipy.ndimage import median_filter
-
+def _turns(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The force [T] without noise, and the indices of the extremes that stand out of the noise, ends included."""
     smooth = median_filter(np.asarray(force, float), 9 if len(force) >= 90 else 3, mode="nearest")
     noise = 1.4826 * np.median(np.abs(np.diff(force) - np.median(np.diff(force)))) / np.sqrt(2)
     step = max(0.05 * np.ptp(smooth), 4.0 * noise)
-    return smooth, *_turns(smooth, step)
-
-
-def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
-    """Indices of the extremes that are at least `step` apart, ends included, and the first way."""
-    turns, best, way, first_way = [0], 0, 0, 0
-    for index, value in enumerate(smooth):
-        if way == 0:
-            if abs(value - smooth[0]) >= step:
-                way = first_way = 1 if value > smooth[0] else -1
-                best = index
-        elif way * (value - smooth[best]) > 0:
-            best = index
-        elif way * (smooth[best] - value) >= step:
-            turns.append(best)
-            way, best = -way, index
-    return [*turns, len(smooth) - 1], first_way
+    inner = [find_peaks(way * smooth, prominence=step)[0] for way in (1, -1)]
+    return smooth, np.concatenate([[0], np.sort(np.concatenate(inner)), [len(smooth) - 1]])
 
 
 def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -146,6 +123,11 @@ def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.n
         typical = float(np.quantile(np.abs(array), 0.75))
         if typical > _LARGEST[given]:
             raise CalibrationError(f"{where}: {name} of {typical:g} {given}: give {given}, not counts or thousandths")
+        if np.mean(np.abs(array) >= np.max(np.abs(array)) * (1 - 1e-9)) > _SATURATED:
+            raise CalibrationError(
+                f"{where}: {name} stays at its maximum of {np.max(np.abs(array)):.3g} {given}: saturated; press more "
+                "gently, or raise the limit"
+            )
     _check_range(force, where)
     return force, value
 
@@ -157,26 +139,9 @@ def _check_range(force: np.ndarray, where: str) -> None:
         raise CalibrationError(f"{where}: {stays}: press over at least {MIN_FORCE_RANGE} N")
 
 
-def _not_saturated(size: np.ndarray, where: str, name: str) -> np.ndarray:
-    """Mask [T] of the samples below the end of the sensor's range, if they reach it."""
-    highest = np.max(size)
-    top = size >= highest * (1 - 1e-9)
-    # A count or two at the maximum is its resolution; a crowd there is a stop.
-    crowd = np.sum(top) > max(0.02 * len(size), 3)
-    neighbours = np.sum(size >= highest - 0.02 * np.ptp(size)) - np.sum(top)
-    if not (crowd and np.sum(top) > 3 * neighbours):
-        return np.ones(len(size), bool)
-    if np.sum(top) > 0.5 * len(size):
-        raise CalibrationError(
-            f"{where}: {name} sits at its maximum {highest:.3g} in {np.sum(top)} of {len(size)} samples: saturated, "
-            "press more gently or raise the limit"
-        )
-    return ~top
-
-
 def _fit_direction(force: np.ndarray, value: np.ndarray, press: np.ndarray, where: str) -> Line:
     _check_range(force, where)
-    line = fit_line(force, value, group=press)
+    line = fit_line(force, value, press)
     low, high = line.gain_interval
     if low <= 0.0 <= high:
         raise CalibrationError(
@@ -192,9 +157,8 @@ def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
         if line is None:
             notes.append(f"no {name} recorded ({unit}): friction and offset are not apart, {other} stands for both")
             continue
-        width = (line.gain_interval[1] - line.gain_interval[0]) / 2
-        if width > 0.1 * abs(line.gain):
-            notes.append(f"{name} gain known to {100 * width / abs(line.gain):.0f} % only ({unit})")
+        if line.gain_share > 0.1:
+            notes.append(f"{name} gain known to {100 * line.gain_share:.0f} % only ({unit})")
         if line.outliers > 0.1 * line.samples:
             notes.append(f"{name}: {line.outliers} of {line.samples} samples are outliers ({unit})")
         if line.r_squared < 0.9:

@@ -43,9 +43,7 @@ class Side:
     offset_high: Array  # [2, J]
     noise: Array  # [2, J] value, robust standard deviation about the line
     r_squared: Array  # [2, J]
-    condition: Array  # [2, J]
     samples: Array  # [2, J]; 0 for a line taken from the joint's class
-    outliers: Array  # [2, J]
     friction: Array  # [J] value, half the gap between the two lines; NaN where one is missing
     value_max: Array  # [J] largest |value| recorded
     force_max: Array  # [J] N, largest force recorded
@@ -82,31 +80,20 @@ def current_from_counts(calibration: Calibration, counts: jax.Array) -> jax.Arra
     return jnp.asarray(counts, jnp.float32) * calibration.current_per_count
 
 
-def joint_torque(calibration: Calibration, current: Array, direction: jax.Array | float = 0.0) -> jax.Array:
-    """Joint torques [..., J] Nm, in the simulation's sense, from motor currents [..., J] A.
+def joint_torque(calibration: Calibration, current: Array) -> jax.Array:
+    """Joint torques [..., J] Nm, in the simulation's sense, from motor currents [..., J] A with the hand's own sign.
 
-    Args:
-      calibration: closed over or passed through jit.
-      current: A, with the hand's own sign.
-      direction: [..., J] or scalar: 1 where the joint is known to press on (loading line), -1
-        where it yields (unloading line), 0 where unknown: the line half way between, wrong by at
-        most the friction band `calibration.real.friction`.
+    By the lines half way between loading and unloading: a run does not know which way friction acts. They are wrong by
+    at most the friction band, `calibration.real.friction`.
     """
-    real = calibration.real
-    middle_gain, middle_offset = real.middle()
-
-    def pick(lines: Array, middle: jax.Array) -> jax.Array:
-        loading, unloading, between = (align(line, current) for line in (*jnp.asarray(lines), middle))
-        return jnp.where(direction > 0, loading, jnp.where(direction < 0, unloading, between))
-
-    force = (current - pick(real.offset, middle_offset)) / pick(real.gain, middle_gain)
-    gain, offset = calibration.sim.middle()
-    return align(gain, force) * force + align(offset, force)
+    (gain, offset), (sim_gain, sim_offset) = calibration.real.middle(), calibration.sim.middle()
+    force = (current - align(offset, current)) / align(gain, current)
+    return align(sim_gain, force) * force + align(sim_offset, force)
 
 
-def normalised_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
+def normalised_torque(calibration: Calibration, current: jax.Array) -> jax.Array:
     """`joint_torque` over the joints' torque limits: `Readings.joint_torque`. Not clipped."""
-    torque = joint_torque(calibration, current, direction)
+    torque = joint_torque(calibration, current)
     return torque / align(jnp.asarray(calibration.torque_scale), torque)
 
 
@@ -174,9 +161,8 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
     for name, side in (("real", calibration.real), ("sim", calibration.sim)):
         lines.append(f"[{name}]")
         lines += [f"{field} = {_text(values)}" for field, values in vars(side).items()]
-    lines += ["[end]", "complete = true", ""]
     try:
-        write_atomic(Path(path), ["\n".join(lines).encode()])
+        write_atomic(Path(path), ["\n".join([*lines, ""]).encode()])
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
 
@@ -217,9 +203,7 @@ def _calibration(table: dict[str, Any]) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
     if table["format"] != FORMAT or table["version"] != VERSION:
         raise ValueError(f"it has version {table['version']!r:.20}, this library reads {VERSION}")
-    if table["end"] != {"complete": True}:
-        raise ValueError("its end is missing")
-    _refuse_unknown(table, "format", "version", *_WORDS, *_UNITS, "real", "sim", "end")
+    _refuse_unknown(table, "format", "version", *_WORDS, *_UNITS, "real", "sim")
     words: dict[str, Any] = {
         name: tuple(map(str, v)) if isinstance(v := table[name], list) else str(v) for name in _WORDS
     }
@@ -272,8 +256,7 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand | None =
     """
     joints, fingers = calibration.joint_names, calibration.finger_names
     real, sim, scale = calibration.real, calibration.sim, np.asarray(calibration.torque_scale)
-    # `joint_torque` takes the middle of the simulation's lines, and the hand's loading line, unloading line or their
-    # middle. That one needs no check: its gain and offset are means of two of one sign.
+    # `joint_torque` takes the middle of the lines; of the hand's both are checked, so their mean is as good.
     per_ampere = np.mean(sim.gain, 0) / np.asarray(real.gain)  # [2, J] Nm/A
     idle = np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)  # [2, J] Nm
     force = np.zeros(0) if calibration.force_per_torque is None else np.asarray(calibration.force_per_torque)[0]

@@ -3,7 +3,7 @@
     python -m dexsim_real.calibrate --port /dev/serial/by-id/usb-FTDI_... --output hand.toml
 
 The taxels are checked and tared with the motors off. Then each fingertip presses slowly, with rising and falling force.
-With `--gauge ask` a kitchen scale or force gauge is the reference; otherwise the taxels are, as in the paper. The
+With `--gauge` a kitchen scale or force gauge is the reference; otherwise the taxels are, as in the paper. The
 output is written at the end, complete or not at all. `--from-log FILE` fits recorded presses again.
 """
 
@@ -18,14 +18,14 @@ from rich.console import Console
 from rich.table import Table
 
 from dexsim import load_hand
-from dexsim.calibration.maps import Calibration, save_calibration
+from dexsim.calibration.maps import save_calibration
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Gauge, Operator
+from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import Fit, fit, torque_constant_intervals, torque_constants
 from dexsim_real.calibrate.procedure import PressProcedure
@@ -44,11 +44,10 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
       HandError: the procedure failed; the motors are off.
     """
     plan = placements(hand, arguments.fingers, arguments.sides)
-    gauge = Gauge(arguments.gauge, operator) if arguments.gauge else None
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
     arguments = dataclasses.replace(arguments, safety=slow)
     with stopping(), Bench(arguments, hand, operator, "calibrate", **bench) as work:
-        procedure = PressProcedure(work, gauge)
+        procedure = PressProcedure(work)
         pressed = 0
         try:
             procedure.check()
@@ -72,9 +71,8 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     Raises:
       DexsimError: the recordings are insufficient, or a file cannot be written.
     """
-    result = fit(read_presses(logs, hand), hand)
-    operator.console.print(table(result))
-    operator.console.print(force_table(result.calibration))
+    result = fit(*read_presses(logs, hand), hand)
+    operator.console.print(table(result, hand))
     for note in grouped(result.calibration.notes):
         operator.tell(f"note: {note}")
     output = arguments.destination
@@ -89,13 +87,15 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
         operator.tell(f"figure: {arguments.plot}")
 
 
-def table(fit: Fit) -> Table:
+def table(fit: Fit, hand: Hand) -> Table:
     """A table with one row per joint. A cell has loading / unloading, or the worse of the two."""
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
-    heads = ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "max force")
+    heads = ("joint", "pressed with", "Nm / A", "95 %", "R2", "friction", "max force", "tip N / Nm")
     rows = Table(*heads, box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading")
+    assert calibration.force_per_torque is not None, "`press_fit.fit` gives it"
+    tip = dict(zip(hand.root_joint.tolist(), calibration.force_per_torque[0], strict=True))
     for joint, name in enumerate(calibration.joint_names):
         rows.add_row(
             name,
@@ -103,20 +103,10 @@ def table(fit: Fit) -> Table:
             " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
             f"{100 * width[joint]:.1f} %",
             f"{np.min(real.r_squared[:, joint]):.3f}",
-            f"{np.max(real.condition[:, joint]):.1f}",
             f"{1e3 * real.friction[joint]:.0f} mA",
             f"{real.force_max[joint]:.1f} N",
+            f"{tip[joint]:.1f}" if tip.get(joint) else "",
         )
-    return rows
-
-
-def force_table(calibration: Calibration) -> Table:
-    """A table of the forces per root-joint torque; a finger that was not pressed has those of the hand's TOML."""
-    title = "fingertip force over root-joint torque"
-    rows = Table("finger", "N / Nm", "95 %", box=None, padding=(0, 1, 0, 0), title=title)
-    assert calibration.force_per_torque is not None, "`press_fit.fit` gives it"
-    for name, (value, low, high) in zip(calibration.finger_names, calibration.force_per_torque.T, strict=True):
-        rows.add_row(name, *((f"{value:.2f}", f"{low:.2f} to {high:.2f}") if value else ("(hand's TOML)", "")))
     return rows
 
 

@@ -1,24 +1,21 @@
 """Scale of the force: newtons per taxel count by the gauge, how far it may be off, and taxels that read nothing."""
 
 import dataclasses
-import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from dexsim.calibration.sensor import TaxelPress, fit_finger
 from dexsim.core.errors import CalibrationError
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
-from dexsim_real.calibrate.read import PressSession, Recording
+from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.read import Recording, Source
 from dexsim_real.sensors.taxels import around
 
 _ACTIVE = 2.0  # counts above which a taxel takes part
 _NEIGHBOURS = 3.0  # counts, mean of a taxel's neighbours above which it must read something
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
-_GAUGE = 0.015  # of the gauge itself, and of how straight it stands under the press
+_GAUGE = 0.03  # of the gauge itself, and of how straight it stands under a fingertip that turns by up to 0.25 rad
 _PLACE = 0.08  # between places on a fingertip, whose taxels differ
 _NOMINAL = 0.25  # of the taxels without a gauge
 _OTHERS = 0.35  # of a fingertip without a gauge from those with one
@@ -35,13 +32,13 @@ class ForceScale:
     notes: tuple[str, ...]
 
 
-def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> ForceScale:
+def force_scale(source: Source, hand: Hand, pressed: list[Recording]) -> ForceScale:
     """Compare the taxels with the gauge. A press without readings uses those of the finger's other press.
 
     Raises:
       CalibrationError: the readings do not rise with the force.
     """
-    own: dict[int, float] = {}  # by finger: N per count as a run reads them
+    own: dict[int, float] = {}  # by finger: N per count
     newtons, error, notes = {}, {}, []
     for press in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
         levels = {level: press.samples(level) for level in press.gauge if len(press.samples(level))}
@@ -49,29 +46,24 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
             if levels:
                 notes.append(f"{press.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        counts, shown, posture = (
-            np.array([np.array(values)[rows].mean(0) for rows in levels.values()])
-            for values in (press.counts, press.shown, press.position)
-        )
+        counts = np.array([np.array(press.counts)[rows].mean(0) for rows in levels.values()])
         counts = counts * active_taxels(counts, hand.taxel_grid)
         # The fit applies this gain to sums with the dead taxels filled in.
         counts = fill_dead(hand, counts, dead_taxels(hand, counts))
-        gauge = np.array([press.gauge[level] for level in levels]) / upright(hand, press.finger, counts, posture)
+        gauge = np.array([press.gauge[level] for level in levels])
         try:
-            whole, in_run = (
-                fit_finger(TaxelPress(gauge, np.maximum(part, 0.0)[:, None])) for part in (counts.sum(-1), shown)
-            )
+            line = fit_finger(TaxelPress(gauge, np.maximum(counts.sum(-1), 0.0)[:, None])).line
         except CalibrationError as failure:
             raise CalibrationError(f"{press.name}, gauge: {failure}") from None
-        newtons[press.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
-        share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
-        error[press.name] = float(np.hypot(share, _GAUGE))
+        newtons[press.name] = 1.0 / line.gain, -line.offset / line.gain
+        error[press.name] = float(np.hypot(line.gain_share, _GAUGE))
+        low, high = line.widened(float(np.hypot(_GAUGE, _PLACE))).gain_interval
         notes.append(
-            f"{press.name}: {in_run.gain.widened(float(np.hypot(_GAUGE, _PLACE)))} counts per newton by the gauge "
-            f"({in_run.samples} readings), {in_run.offset} counts at zero force"
+            f"{press.name}: {line.gain:.3g} [{low:.3g}, {high:.3g}] counts per newton by the gauge "
+            f"({line.samples} readings), {line.offset:.1f} counts at zero force"
         )
-        own.setdefault(press.finger, 1.0 / in_run.gain.value)
-    others = float(np.mean(list(own.values()))) if own else session.source.hardware.force_per_count
+        own.setdefault(press.finger, 1.0 / line.gain)
+    others = float(np.mean(list(own.values()))) if own else source.hardware.force_per_count
     per_count = np.array([own.get(finger, others) for finger in range(hand.num_fingers)])
     if not own:
         notes.append(f"no gauge: the taxels' scale is the nominal one, which may be {100 * _NOMINAL:.0f} % off")
@@ -84,27 +76,6 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
         newtons.setdefault(press.name, (float(per_count[press.finger]), 0.0))
         error.setdefault(press.name, _PLACE if press.finger in own else _OTHERS if own else _NOMINAL)
     return ForceScale(per_count, newtons, error, bool(own), tuple(notes))
-
-
-def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Share [K] of each force [K, N] that the gauge shows: it stands still while the fingertip turns.
-
-    It faces the fingertip at the smallest of the forces that the taxels feel, at joint angles [K, J]. Where they feel
-    none their sum has any sign and direction: the share is then 1.
-    """
-    sums = counts.sum(-1)
-    active = sums >= _ACTIVE
-    if not active.any():
-        return np.ones(len(counts))
-    normals = [np.asarray(_normals(hand, finger, jnp.asarray(q, jnp.float32))) for q in position]
-    push = np.array([weight @ normal for weight, normal in zip(np.maximum(counts, 0.0), normals, strict=True)])
-    push /= np.maximum(np.linalg.norm(push, axis=-1, keepdims=True), 1e-9)
-    return np.where(active, push @ push[np.where(active, sums, np.inf).argmin()], 1.0)
-
-
-@functools.partial(jax.jit, static_argnames=("hand", "finger"))
-def _normals(hand: Hand, finger: int, position: jax.Array) -> jax.Array:
-    return taxel_normals(hand, forward_kinematics(hand, position))[finger]
 
 
 def active_taxels(counts: np.ndarray, grid: tuple[int, int]) -> np.ndarray:

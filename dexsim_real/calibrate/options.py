@@ -49,11 +49,9 @@ class CalibrateArguments(Config):
     finished it."""
     identify: bool = False
     """Identify the drives instead: move each free joint, and fit stiffness, damping, friction and latency."""
-    gauge: str | None = None
-    """Compare the taxels with a gauge: `ask` to type the readings of a kitchen scale or force gauge, or MODULE:FUNCTION
-    for a function that returns newtons. None: the taxels are the reference, as in the paper."""
-    levels: int = setting(6, unit="1", low=5, high=30)
-    """Number of forces at which the gauge is read, both rising and falling."""
+    gauge: bool = False
+    """Compare the taxels with a kitchen scale or force gauge, whose readings you type. Otherwise the taxels are the
+    reference, as in the paper."""
     fingers: tuple[str, ...] = ()
     """Fingers to press; all by default. The other joints get the mean of those with the same torque limit."""
     sides: bool = True
@@ -92,6 +90,8 @@ class CalibrateArguments(Config):
         outputs = {"--output": self.destination, "--plot": self.plot, "--log": self.log}
         inputs = {f"--from-log {path}": path for path in self.from_log}
         cli.check_no_overwrite(outputs, inputs | {"calibration": self.calibration})
+        if self.gauge and self.yes:
+            raise HandError("--gauge needs answers, but --yes asks nothing; remove one of them")
         # With another finger or joint than meant the wrong one would move.
         own = {"fingers": False, "gauge": False, "plot": False, "joints": True, "dead_band": True}
         for name, identify in own.items():

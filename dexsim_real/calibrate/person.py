@@ -1,30 +1,25 @@
-"""The person beside the hand, and the reference force of a press: typed by that person, or by a function."""
+"""The person beside the hand, who answers questions and reads a gauge while the hand keeps moving."""
 
 import contextlib
 import io
-import queue
 import re
 import sys
+import termios
 import threading
-import time
 from collections.abc import Callable
 from typing import TextIO
 
-import numpy as np
 from rich.console import Console
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.names import find_function
 
 _READING = re.compile(r"([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*(n|g|kg|)", re.IGNORECASE)
 _NEWTONS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
 _LARGEST = 100.0  # N, largest plausible reading
-_AT_ONCE = 0.005  # s in which most functions answer; the hand goes on without an exchange meanwhile
-_SLOWEST = 10.0  # s, longest wait for a function
 
 
 class Operator:
-    """The person beside the hand: reads instructions, and answers questions while the hand keeps moving.
+    """The person beside the hand.
 
     Args:
       console: for output.
@@ -35,8 +30,6 @@ class Operator:
     def __init__(self, console: Console, *, assume_yes: bool = False, stream: TextIO | None = None):
         self.console, self.assume_yes = console, assume_yes
         self._stream = stream or sys.stdin or io.StringIO()  # Python has no `sys.stdin` where it was closed.
-        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._reader: threading.Thread | None = None
 
     def tell(self, text: str) -> None:
         """Print one line."""
@@ -48,85 +41,33 @@ class Operator:
         Raises:
           HandError: the input is closed.
         """
-        while self._stream.isatty() and not self._lines.empty():  # Discard keys pressed before the question.
-            if not self._lines.get():
-                self._lines.put("")  # The end of the input remains: no answer will follow.
-                break
+        if self._stream.isatty():
+            termios.tcflush(self._stream, termios.TCIFLUSH)  # Discard keys pressed before the question.
         self.tell(text)
-        if self._reader is None:
-            self._reader = threading.Thread(target=self._read, name="answers", daemon=True)
-            self._reader.start()
-        while self._lines.empty():
+        lines = [""]  # What remains if the terminal hangs up.
+
+        def read() -> None:
+            with contextlib.suppress(OSError, ValueError):
+                lines.append(self._stream.readline())
+
+        reader = threading.Thread(target=read, name="answer", daemon=True)
+        reader.start()
+        while reader.is_alive():
             meanwhile()
-        line = self._lines.get()
-        if not line:
-            self._lines.put("")  # For the next question.
+        if not lines[-1]:
             raise HandError("standard input is closed; run in a terminal, or give --yes")
-        return line.strip()
+        return lines[-1].strip()
 
-    def _read(self) -> None:
-        with contextlib.suppress(OSError, ValueError):  # A terminal that hangs up, or no text: it ends here as well.
-            for line in self._stream:
-                self._lines.put(line)
-        self._lines.put("")
-
-
-class Gauge:
-    """A force gauge.
-
-    Args:
-      source: "ask", or MODULE:FUNCTION of a function without arguments that returns newtons.
-      operator: is asked for readings.
-
-    Raises:
-      HandError: the function cannot be found, or there is nobody to ask.
-    """
-
-    def __init__(self, source: str, operator: Operator):
-        self._operator, self.automatic = operator, source != "ask"
-        if self.automatic:
-            self._function = find_function(source, f"--gauge {source}", "ask, or MODULE:FUNCTION")
-        elif operator.assume_yes:
-            raise HandError("--gauge ask needs answers, but --yes asks nothing; remove one of them")
-
-    def read(self, meanwhile: Callable[[], object]) -> float | None:
-        """Force N; None when the user skips the reading. `meanwhile` is called until user or function answers.
-
-        Raises:
-          HandError: the function fails, takes too long, or returns no number; or the user cannot answer.
-        """
-        if self.automatic:
-            return self._call(meanwhile)
+    def ask_force(self, meanwhile: Callable[[], object]) -> float | None:
+        """Ask for the reading of the gauge in N until it is one; None when the user skips it."""
         while True:
-            text = self._operator.ask("  reading of the gauge (newtons, or a number with g or kg; s skips):", meanwhile)
+            text = self.ask("  reading of the gauge (newtons, or a number with g or kg; s skips):", meanwhile)
             if text.lower() in ("s", "skip"):
                 return None
             try:
                 return parse_reading(text)
             except HandError as error:
-                self._operator.tell(f"  {error}")
-
-    def _call(self, meanwhile: Callable[[], object]) -> float:
-        """What the function returns. It has its own thread: the pressing hand needs an exchange every cycle."""
-        force, failure = np.nan, "did not return in time"
-
-        def call() -> None:
-            nonlocal force, failure
-            try:
-                force, failure = float(self._function()), ""
-            except BaseException as error:  # Also a SystemExit of the user's function.
-                failure = f"failed ({type(error).__name__}: {error})"
-
-        thread = threading.Thread(target=call, name="gauge", daemon=True)
-        thread.start()
-        thread.join(_AT_ONCE)
-        until = time.monotonic() + _SLOWEST
-        while thread.is_alive() and time.monotonic() < until:
-            meanwhile()
-        if failure or not abs(force) <= _LARGEST:
-            failure = failure or f"returned {force:g}, but a fingertip presses with less than {_LARGEST:g} N"
-            raise HandError(f"the function of --gauge {failure}; check the gauge")
-        return force
+                self.tell(f"  {error}")
 
 
 def parse_reading(text: str) -> float:

@@ -15,20 +15,21 @@ lever arm, and of the motors' temperature.
 import dataclasses
 import functools
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import MIN_SAMPLES, JointPress, fit_joint
-from dexsim.calibration.maps import Calibration, joint_torque
+from dexsim.calibration.joint import MIN_SAMPLES, JointPress
+from dexsim.calibration.maps import Calibration, Side
 from dexsim.calibration.press import MIN_LEVER
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
-from dexsim_real.calibrate.force_scale import active_taxels, dead_taxels, fill_dead, force_scale
+from dexsim_real.calibrate.force_scale import ForceScale, active_taxels, dead_taxels, fill_dead, force_scale
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, TOUCHED, UNLOADING
-from dexsim_real.calibrate.read import PressSession, Recording
+from dexsim_real.calibrate.read import Recording, Source
 from dexsim_real.sensors.taxels import taxel_names
 
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
@@ -61,6 +62,15 @@ class Blocks:
     press: np.ndarray  # [B] number of the press, up and down
 
 
+class JointFit(NamedTuple):
+    """What a press says of a joint."""
+
+    press: str
+    lever: float  # m
+    real: JointPress
+    sim: JointPress
+
+
 @dataclasses.dataclass(frozen=True)
 class Fit:
     """A calibration, and the data that it was fitted to."""
@@ -71,14 +81,14 @@ class Fit:
     source: dict[str, str]  # press that each joint was fitted to
 
 
-def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
+def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand, created: str | None = None) -> Fit:
     """Fit a calibration to all recorded presses; `created` is its date, by default now.
 
     Raises:
       CalibrationError: recordings are missing or unusable.
     """
     blocks, notes = {}, list[str]()
-    for name, recording in session.recordings.items():
+    for name, recording in recordings.items():
         if not len(recording.samples(LOADING, UNLOADING)):
             continue
         part = make_blocks(recording, hand.taxel_grid)
@@ -88,47 +98,14 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
-    scale = force_scale(session, hand, [session.recordings[name] for name in blocks])
-    real, sim, source = dict[str, JointPress](), dict[str, JointPress](), dict[str, str]()
-    reach: dict[str, float] = {}
+    scale = force_scale(source, hand, [recordings[name] for name in blocks])
+    best = dict[str, JointFit]()  # by joint: of the press with the longest lever arm
     for name, part in blocks.items():
-        recording, (gain, offset) = session.recordings[name], scale.newtons[name]
-        dead = dead_taxels(hand, part.counts)
-        counts = fill_dead(hand, part.counts, dead)
-        force = counts.sum(-1) * gain + offset
-        torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
-        high = force > 0.5 * force.max()
-        lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
-        # Shear over normal force by the taxels, and the torque by it over the force.
-        sums = counts.sum(-1)
-        firm = sums > 0.5 * sums.max()
-        shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
-        posture, weight = (v.astype(np.float32) for v in (part.position[high].mean(0), counts.sum(0) / counts.sum()))
-        slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
-        # The force that the gauge adds to the taxels' sum acts at the same place.
-        torque += offset * lever
-        for joint in recording.joints:
-            label, arm = hand.joint_names[joint], abs(lever[joint])
-            if arm < max(MIN_LEVER, reach.get(label, 0.0)):
-                continue
-            if slip[joint] > _TRUST * arm:
-                notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
-                continue
-            way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
-            way[_at_limit(part.current[:, joint], part.run)] = 0
-            if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
-                notes.append(
-                    f"{label}: hardly moved while the {name} was pressed, held by friction; press on something softer, "
-                    "or more often"
-                )
-                continue
-            reach[label], source[label] = arm, name
-            # A force read too large makes the gain of the current too small, and leaves the lever arm.
-            known, placed = float(np.hypot(scale.error[name], _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
-            real[label] = JointPress(force, part.current[:, joint], way, part.press, known)
-            sim[label] = JointPress(force, torque[:, joint], way, part.press, placed)
-        notes += _press_notes(hand, recording, dead, shear)
-    identity = session.source.identity
+        for label, joint_fit in _press(hand, recordings[name], part, scale, notes).items():
+            if label not in best or joint_fit.lever > best[label].lever:
+                best[label] = joint_fit
+    real, sim = {j: f.real for j, f in best.items()}, {j: f.sim for j, f in best.items()}
+    identity = source.identity
     try:
         calibration = calibrate(
             hand,
@@ -145,10 +122,51 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     own = [note for note in calibration.notes if not (scale.gauged and note.startswith("only the ratio"))]
     calibration = dataclasses.replace(
         calibration,
-        force_per_torque=_force_per_torque(hand, calibration, real, sim),
+        force_per_torque=_force_per_torque(hand, calibration, real),
         notes=(*own, METHOD, *scale.notes, *notes),
     )
-    return Fit(calibration, real, sim, source)
+    return Fit(calibration, real, sim, {label: joint_fit.press for label, joint_fit in best.items()})
+
+
+def _press(hand: Hand, recording: Recording, part: Blocks, scale: ForceScale, notes: list[str]) -> dict[str, JointFit]:
+    """What one press says of each of its joints; of what it does not, it adds notes."""
+    name, (gain, offset) = recording.name, scale.newtons[recording.name]
+    dead = dead_taxels(hand, part.counts)
+    counts = fill_dead(hand, part.counts, dead)
+    force = counts.sum(-1) * gain + offset
+    torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
+    high = force > 0.5 * force.max()
+    lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
+    # Shear over normal force by the taxels, and the torque by it over the force.
+    sums = counts.sum(-1)
+    firm = sums > 0.5 * sums.max()
+    shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
+    posture, weight = (v.astype(np.float32) for v in (part.position[high].mean(0), counts.sum(0) / counts.sum()))
+    slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
+    # The force that the gauge adds to the taxels' sum acts at the same place.
+    torque += offset * lever
+    fits = {}
+    for joint in recording.joints:
+        label, arm = hand.joint_names[joint], float(abs(lever[joint]))
+        if arm < MIN_LEVER:
+            continue
+        if slip[joint] > _TRUST * arm:
+            notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
+            continue
+        way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
+        way[_at_limit(part.current[:, joint], part.run)] = 0
+        if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
+            notes.append(
+                f"{label}: hardly moved while the {name} was pressed, held by friction; press on something softer, "
+                "or more often"
+            )
+            continue
+        # A force read too large makes the gain of the current too small, and leaves the lever arm.
+        known, placed = float(np.hypot(scale.error[name], _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
+        real = JointPress(force, part.current[:, joint], way, part.press, known)
+        fits[label] = JointFit(name, arm, real, JointPress(force, torque[:, joint], way, part.press, placed))
+    notes += _press_notes(hand, recording, dead, shear)
+    return fits
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
@@ -229,36 +247,34 @@ def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     return selected
 
 
-def _force_per_torque(
-    hand: Hand, calibration: Calibration, real: Mapping[str, JointPress], sim: Mapping[str, JointPress]
-) -> np.ndarray:
+def _force_per_torque(hand: Hand, calibration: Calibration, real: Mapping[str, JointPress]) -> np.ndarray:
     """Force of a fingertip over the torque of its finger's root joint, as a run reads that torque.
 
     A run does not know whether a finger closes or opens: the value is half way between the lines of both directions,
-    and the interval reaches to them, and by what the presses and the lever arm leave open beyond. What weight and
-    friction add to the torque is in the lines' offsets.
+    and the interval reaches to them, and by what the presses and the lever arm leave open beyond. The scale of the
+    force cancels out. What weight and friction add to the torque is in the lines' offsets.
 
     Returns:
       [3, F] N/Nm: value, low, high of the 95 % interval; 0 where nothing pressed.
     """
     ratio = np.zeros((3, hand.num_fingers))
+    per_ampere = np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
+    gains = np.abs(calibration.real.gain * per_ampere)  # [2, J] Nm/N
+    shares = [np.max((side.gain_high - side.gain_low) / 2 / np.abs(side.gain), 0) for side in _sides(calibration)]
     for finger, joint in enumerate(hand.root_joint):
-        name = hand.joint_names[joint]
+        name, gain = hand.joint_names[joint], gains[:, joint]
         if name not in real:
             continue
-        press = real[name]
-        current = np.zeros((len(press.value), hand.num_joints), np.float32)
-        current[:, joint] = press.value
-        torque = np.asarray(joint_torque(calibration, current), float)[:, joint]
-        read = JointPress(press.force, torque, press.direction, press.press, sim[name].gain_error)
-        both = fit_joint(read, "Nm", where=f"{name} in a run")
-        lines = [line for line in (both.loading, both.unloading) if line is not None]
-        gain = np.abs([line.gain for line in lines])
-        known = max(np.ptp(line.gain_interval) / 2 for line in lines)
-        middle, half = gain.mean(), float(np.hypot(known, np.ptp(gain) / 2))
+        presses = np.sqrt(max(shares[0][joint] ** 2 - real[name].gain_error ** 2, 0.0))
+        share = np.hypot(presses, shares[1][joint])
+        middle, half = gain.mean(), float(np.hypot(share * gain.mean(), np.ptp(gain) / 2))
         if half < middle:
             ratio[:, finger] = 1.0 / np.array([middle, middle + half, middle - half])
     return ratio
+
+
+def _sides(calibration: Calibration) -> tuple[Side, Side]:
+    return calibration.real, calibration.sim
 
 
 def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: float) -> list[str]:
@@ -284,11 +300,11 @@ def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: floa
 
 def torque_constants(calibration: Calibration) -> np.ndarray:
     """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
-    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
+    return calibration.sim.gain / calibration.real.gain
 
 
 def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
     """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
-    sides, value = (calibration.real, calibration.sim), torque_constants(calibration)
-    share = np.hypot(*(np.asarray(side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in sides))
+    value = torque_constants(calibration)
+    share = np.hypot(*((side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in _sides(calibration)))
     return value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])

@@ -11,13 +11,11 @@ import math
 import numpy as np
 
 from dexsim_real.calibrate.bench import Bench
-from dexsim_real.calibrate.person import Gauge
 from dexsim_real.calibrate.plan import Placement
 from dexsim_real.control.safety import Reaction
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
 from dexsim_real.loop import Exchange
-from dexsim_real.sensors.taxels import taxel_names
 
 LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 """Phases of a press; "level K" is a force held for the gauge."""
@@ -26,14 +24,12 @@ TOUCHED = 20.0
 
 _REST = 2.0  # s, recording with the motors off
 _ANSWERED = 0.5  # share of the exchanges at rest that must be answered
-_NOISY = 3.0  # counts, standard deviation at rest above which a taxel is noisy
-_DRIFT = 15.0  # counts by which a fingertip's sum may change at rest
-_SMOOTH = 10  # samples of the moving mean for the drift
 _TOUCH = 0.4  # N above which a fingertip touches
 _CLEARANCE = 0.2  # rad from the start of a press to the posture of contact
 _TRAVEL = 0.8  # rad, largest travel of a joint target past contact
 _LAST = 12  # samples at the end of a press that are averaged
 _STALL = 0.02  # share of the peak force by which the force must grow in a second, or the motors stall
+_LEVELS = 6  # forces at which the gauge is read, rising and then falling
 _ATTEMPTS = 3  # at a press, with nobody to ask
 _LEAST_MOTION = 0.004  # rad that each joint should move in a press
 _LEAN = (0.5, -0.5, 0.0)  # more motion of the first joints or the last: presses with different shear
@@ -52,11 +48,10 @@ class PressProcedure:
 
     Args:
       bench: connected, motors off.
-      gauge: None when the taxels are the reference.
     """
 
-    def __init__(self, bench: Bench, gauge: Gauge | None):
-        self.bench, self.operator, self.gauge = bench, bench.operator, gauge
+    def __init__(self, bench: Bench):
+        self.bench, self.operator = bench, bench.operator
         self.config, self.hand = bench.arguments.press, bench.sensing.hand
         self._advance = 0.0  # rad past the posture
         self._touch = _TOUCH  # N
@@ -71,14 +66,7 @@ class PressProcedure:
         exchanges = self.bench.collect(_REST, mark={"press": "", "phase": REST})
         if len(exchanges) < _ANSWERED * self.bench.arguments.rate * _REST:
             raise HandError(f"only {len(exchanges)} answers in {_REST:g} s; check the cable, or close other programs")
-        counts = np.array([self.bench.sensing.counts(exchange.state) for exchange in exchanges])
         self.bench.set_zero(exchanges)
-        for finger, name in enumerate(self.hand.finger_names):
-            check_steady(name, counts[:, finger].sum(-1))
-            noise = counts[:, finger].std(0)
-            if np.any(noise > _NOISY):
-                which = taxel_names(self.hand, noise > _NOISY)
-                self.operator.tell(f"  {name}: noisy: {which} (up to {noise.max():.1f} counts)")
 
     def press(self, placement: Placement) -> bool:
         """All presses of one placement, again when they are missed; False when the user skips it.
@@ -115,8 +103,8 @@ class PressProcedure:
             self._seek(self._touch, -speed, UNLOADING)  # until it is almost free
             self._aim(_LEAN[cycle % len(_LEAN)])
         # Typing readings takes long, so the sides use the scale of the pads.
-        if self.gauge is not None and (self.gauge.automatic or placement.name.endswith("pad")):
-            self._climb(self.gauge, speed)
+        if self.bench.arguments.gauge and placement.name.endswith("pad"):
+            self._climb(speed)
         self._back_off()
         return True
 
@@ -195,19 +183,18 @@ class PressProcedure:
         self._direction = np.zeros(self.hand.num_joints)
         self._direction[joints] = way * advance / advance.max()
 
-    def _climb(self, gauge: Gauge, speed: float) -> None:
-        """Hold rising and falling forces, and read the gauge at each."""
-        levels, pause = self.bench.arguments.levels, self.config.pause
-        shares = np.linspace(1 / levels, 1.0, levels)
+    def _climb(self, speed: float) -> None:
+        """Hold rising and falling forces, and ask for the gauge's reading at each."""
+        pause, shares = self.config.pause, np.linspace(1 / _LEVELS, 1.0, _LEVELS)
         for number, share in enumerate([*shares, *shares[-2::-1]]):
-            self._seek(share * self.config.peak, speed if number < levels else -speed)
+            self._seek(share * self.config.peak, speed if number < _LEVELS else -speed)
             self.bench.collect(pause, self._target())
             phase = f"level {number}"
             mark = {"press": self._placement.name, "phase": phase}
             held = self.bench.collect(pause, self._target(), mark)
             mean = np.mean([self._force(exchange) for exchange in held])
             self.operator.tell(f"  holding; the taxels read {mean:.1f} N")
-            force = gauge.read(lambda: self._step(0.0, phase))  # noqa: B023
+            force = self.operator.ask_force(lambda: self._step(0.0, phase))  # noqa: B023
             if force is not None:
                 self.bench.annotate({**mark, "gauge": force})
 
@@ -257,18 +244,3 @@ class PressProcedure:
 
     def _overloaded(self, exchange: Exchange) -> bool:
         return float(exchange.sample.measured.current.max()) >= self.config.current
-
-
-def check_steady(name: str, sums: np.ndarray) -> None:
-    """Check that a fingertip's sum [T] counts does not move by more than noise explains.
-
-    Raises:
-      HandError: it moves, so something touches the fingertip: lightly enough to be tared away.
-    """
-    drift = np.ptp(np.convolve(sums, np.full(_SMOOTH, 1 / _SMOOTH), "valid"))
-    usual = 6 * np.std(np.diff(sums)) / np.sqrt(2 * _SMOOTH)
-    if drift > _DRIFT + usual:
-        raise HandError(
-            f"cannot tare the taxels: the {name}'s sum moved by {drift:.0f} counts at rest: something touches it; free "
-            "the fingertip"
-        )

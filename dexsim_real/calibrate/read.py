@@ -30,33 +30,27 @@ def read_logs(paths: Iterable[Path], task: str) -> tuple[Source, list[list[Recor
     Raises:
       LogError: a log of another task, hand or configuration than the logs before.
     """
-    first, logs = None, []
+    sources, logs = list[Source](), []
     for path in paths:
+        records = []
         with reading(path):
-            source, records = _read_log(Path(path), task)
-            first = first or source
-            for what, own, before in zip(("--hardware options", "--rate", "hand"), source, first, strict=True):
-                if own != before:
-                    raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")
-            logs.append(records)
-    assert first is not None, "no log given"
-    return first, logs
-
-
-def _read_log(path: Path, task: str) -> tuple[Source, list[Record]]:
-    source, records = None, []
-    for record in LogReader(path):
-        content = record.content
-        if record.kind == Kind.META and "task" in content:
-            if content["task"] != task:
-                raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
-            identity = Identity(content["serial"], content["handedness"])
-            source = Source(from_dict(HardwareConfig, content["hardware"]), float(content["rate"]), identity)
-        elif record.kind in (Kind.META, Kind.TICK):
-            records.append(record)
-    if source is None:
-        raise LogError(f"{path}: the log ends before the hand was ready; record again")
-    return source, records
+            for record in LogReader(path):
+                content = record.content
+                if record.kind == Kind.META and "task" in content:
+                    if content["task"] != task:
+                        raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
+                    identity = Identity(content["serial"], content["handedness"])
+                    hardware = from_dict(HardwareConfig, content["hardware"])
+                    sources.append(Source(hardware, float(content["rate"]), identity))
+                elif record.kind in (Kind.META, Kind.TICK):
+                    records.append(record)
+        logs.append(records)
+        if len(sources) < len(logs):
+            raise LogError(f"{path}: the log ends before the hand was ready; record again")
+        for what, own, first in zip(("--hardware options", "--rate", "hand"), sources[-1], sources[0], strict=True):
+            if own != first:
+                raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")
+    return sources[0], logs
 
 
 @dataclasses.dataclass
@@ -70,7 +64,6 @@ class Recording:
     phase: list[str] = dataclasses.field(default_factory=list)
     time: list[float] = dataclasses.field(default_factory=list)  # s
     counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] tared, negative ones included
-    shown: list[float] = dataclasses.field(default_factory=list)  # counts of the fingertip as in a run
     shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of x and y beyond the rest's
     current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the sign of the hand
     position: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] rad
@@ -86,15 +79,7 @@ class Recording:
         return RELEASED in self.phase
 
 
-@dataclasses.dataclass
-class PressSession:
-    """The content of one or several logs of presses."""
-
-    source: Source
-    recordings: dict[str, Recording]
-
-
-def read_presses(paths: Iterable[Path], hand: Hand) -> PressSession:
+def read_presses(paths: Iterable[Path], hand: Hand) -> tuple[Source, dict[str, Recording]]:
     """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that finished it.
 
     Raises:
@@ -108,7 +93,7 @@ def read_presses(paths: Iterable[Path], hand: Hand) -> PressSession:
             # A press that was skipped or missed is in its log without samples.
             if before is None or press.time and (press.finished or not before.time):
                 recordings[name] = press
-    return PressSession(source, recordings)
+    return source, recordings
 
 
 def _presses(source: Source, records: list[Record], hand: Hand) -> dict[str, Recording]:
@@ -135,7 +120,6 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> dict[str, Rec
             press.phase.append(content["phase"])
             press.time.append(record.time)
             press.counts.append(sensing.counts(state)[finger].astype(float) - sensing.tare[finger].astype(float))
-            press.shown.append(float(measured.taxel_force[finger].sum()) / sensing.config.force_per_count)
             press.shear.append(shear[finger])
             press.current.append(state["joint"]["current"].astype(float) * 1e-3)
             press.position.append(measured.joint_position.astype(float))

@@ -31,8 +31,8 @@ _HEAD = struct.Struct("<4sII")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
-_LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
 _CHECKED = 4  # checksums over one byte of a log, on average; 1 without damage
+_LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
 
 
 class LogError(DexsimError):
@@ -159,19 +159,17 @@ class LogReader:
         # A false head costs a checksum over all that it claims: without a bound a forged file would cost its square.
         left = _CHECKED * len(data) + _LONGEST
         while at < len(data):
-            payload = _payload(data, at)
-            left -= len(payload)
+            record, end = _decode(data, at)
+            left -= end - at
             if left < 0:
                 raise LogError(f"{self.path}: nearly all of it is damaged; record again")
-            record = _decode(data, at, payload)
-            if record is None:
-                following = data.find(SYNC, at + 1)
-                following = len(data) if following < 0 else following
-                self.damaged += following - at
-                at = following
-            else:
-                at += _HEAD.size + len(payload)
+            if record is not None:
                 yield record
+            else:  # Go on at what looks like the next record.
+                end = data.find(SYNC, at + 1)
+                end = len(data) if end < 0 else end
+                self.damaged += end - at
+            at = end
 
 
 @contextlib.contextmanager
@@ -191,23 +189,19 @@ def reading(path: str | Path) -> Iterator[None]:
         ) from error
 
 
-def _payload(data: bytes, at: int) -> bytes:
-    """What the head at this place claims; empty where there is none."""
-    if data[at : at + len(SYNC)] != SYNC or at + _HEAD.size > len(data):
-        return b""
-    _, length, _ = _HEAD.unpack_from(data, at)
+def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
+    """The record at a place, None where there is no intact one; and the end of what was read for it."""
+    if at + _HEAD.size > len(data):
+        return None, at
+    sync, length, checksum = _HEAD.unpack_from(data, at)
     end = at + _HEAD.size + length
-    return data[at + _HEAD.size : end] if length <= _LONGEST and end <= len(data) else b""
-
-
-def _decode(data: bytes, at: int, payload: bytes) -> Record | None:
-    if not payload or zlib.crc32(payload) != _HEAD.unpack_from(data, at)[2]:
-        return None
-    try:
-        kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-        return Record(Kind(kind), when, content)
-    except Exception:  # A checksum can be forged; msgpack and NumPy each raise their own.
-        return None
+    payload = data[at + _HEAD.size : end]
+    if sync != SYNC or length > _LONGEST or len(payload) < length:
+        return None, at
+    if zlib.crc32(payload) != checksum:
+        return None, end
+    kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
+    return Record(Kind(kind), when, content), end
 
 
 def _pack_array(value: Any) -> Any:

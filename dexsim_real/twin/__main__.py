@@ -6,12 +6,10 @@ It prints the command that runs a policy on it, and ends after its trials or wit
 """
 
 import dataclasses
-import queue
 import shlex
 import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -70,17 +68,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         cli.check_writable(arguments.output)
     hand = load_hand(arguments.hand or None)
     check_wire(hand)
-    lines: queue.SimpleQueue = queue.SimpleQueue()
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
-        twin = Twin(arguments, make_plant(arguments, hand), Path(folder), lines.put)
+        twin = Twin(arguments, make_plant(arguments, hand), Path(folder), _show)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = Path(folder) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
         known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
         save_calibration(calibration, known)
-        printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
-        printer.start()
         try:
-            lines.put(
+            _show(
                 f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
                 f"    {shlex.join(runner_command(twin, calibration))}"
             )
@@ -88,8 +83,6 @@ def main(argv: Sequence[str] | None = None) -> int:
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
             twin.run()
         finally:
-            lines.put(None)
-            printer.join(2.0)
             twin.close()
             if arguments.output:
                 cli.write_json(arguments.output, twin.report())
@@ -98,10 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _print(lines: queue.SimpleQueue) -> None:
-    """Print lines in a background thread, so that the terminal never blocks the hand's port."""
-    for text in iter(lines.get, None):
-        print(text, flush=True)
+def _show(text: str) -> None:
+    print(text, flush=True)
 
 
 if __name__ == "__main__":

@@ -48,5 +48,3 @@ class TwinArguments(Config):
     SECONDS`, `heat JOINT|tipTIP|palm KELVIN SECONDS`, `error palm|joint|tip JOINT BITS SECONDS`, `off JOINT SECONDS`
     (-1: all), `jam JOINT MILLIAMPERES SECONDS`, `refuse NUMBER SECONDS`, `angle JOINT offset|stuck RADIANS SECONDS`,
     `stuck TIP TAXEL COUNT`."""
-    watchdog: float = setting(0.0, unit="s", low=0.0, high=10.0)
-    """Time without a valid exchange after which the motors go off; 0: never. What the real hand does is not known."""

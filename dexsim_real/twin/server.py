@@ -84,7 +84,7 @@ class Twin:
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.start, seed = time.monotonic(), arguments.seed
         self.clock = PlantClock(plant, self.start, self.note)
-        self.firmware = Firmware(plant, arguments.watchdog, self.note)
+        self.firmware = Firmware(plant, self.note)
         self.injector = Injector(arguments.faults, seed)
         terminal = Terminal(arguments.link or folder / "hand")
         self.line = HandLine(
@@ -154,7 +154,6 @@ class Twin:
             "line": dict(self.line.counts),
             "exchanges": dict(self.firmware.counts),
             "injected_faults": dict(self.injector.injected),
-            "watchdog_trips": self.firmware.trips,
             "slipped_s": round(self.clock.slipped, 3),
             "late": self.line.lateness.summary(),
             "events": [list(event) for event in self.events],

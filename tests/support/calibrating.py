@@ -1,6 +1,7 @@
 """The press procedure on a simulated bench, for tests."""
 
 import io
+import queue
 
 import numpy as np
 from press_bench import Plate
@@ -47,6 +48,32 @@ def arguments(folder, **options):
 
 def operator():
     return Operator(Console(file=io.StringIO(), width=200), assume_yes=True)
+
+
+class Typist(io.StringIO):
+    """A terminal and who sits at it: presses Enter when told to, types what the scale shows, `force()` in N."""
+
+    def __init__(self, force):
+        super().__init__()
+        self.force, self.lines, self.read = force, queue.SimpleQueue(), 0
+
+    def write(self, text):
+        if "Enter presses" in text:
+            self.lines.put("\n")
+        elif "reading of the gauge" in text:
+            self.read += 1
+            # A slip of the finger first: it is asked for again.
+            self.lines.put("five\n" if self.read == 2 else f"{1e3 * self.force() / 9.80665:.2f} g\n")
+        return super().write(text)
+
+    def readline(self):
+        return self.lines.get()
+
+    def isatty(self):
+        return False
+
+    def operator(self):
+        return Operator(Console(file=self, width=200), stream=self)
 
 
 def record(bench, hand, options, who=None):

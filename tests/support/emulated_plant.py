@@ -15,8 +15,8 @@ IDEAL = {"efficiency": 1.0} | dict.fromkeys(
 )
 
 
-def motors(position, *, kp=100, ki=0, kd=0, torque_max=300, mode=Mode.POSITION):
-    return command_block(position, kp=kp, ki=ki, kd=kd, torque_max=torque_max, mode=mode)
+def motors(position, *, kp=100, torque_max=300, mode=Mode.POSITION):
+    return command_block(position, kp=kp, ki=0, kd=0, torque_max=torque_max, mode=mode)
 
 
 def drives(hand, heat=None, **overrides):

@@ -168,11 +168,3 @@ class BenchHand:
             counts[finger, index] = 0.0
         taxel["z"] = np.clip(np.round(counts), 0, 255)
         return block
-
-
-GAUGE = None
-
-
-def read_gauge():
-    """What the instrument of the test shows, for `--gauge press_bench:read_gauge`."""
-    return GAUGE()

@@ -28,12 +28,12 @@ def request(block=None):
 class Cable:
     """Both ends of a cable in memory: a `Terminal` for the hand, pyserial's port for the host, and their clock."""
 
-    connected, baud = True, 3_000_000
+    connected = True
 
-    def __init__(self, faults=(), seed=0, watchdog=0.0):
+    def __init__(self, faults=(), seed=0):
         self.now, self.plant, self.notes = 1000.0, ScriptedPlant(), []
         self.to_hand, self.to_host = bytearray(), bytearray()
-        self.board = Firmware(self.plant, watchdog, self.notes.append)
+        self.board = Firmware(self.plant, self.notes.append)
         self.injector = Injector(faults, seed)
         self.line = HandLine(
             self, self.board, self.injector, seed=seed, catch_up=self._catch_up, note=self.notes.append
@@ -119,10 +119,10 @@ class Port:
 class Pair(Cable):
     """The bridge's driver and an emulated hand on one cable."""
 
-    def __init__(self, monkeypatch, faults=(), seed=0, watchdog=0.08):
+    def __init__(self, monkeypatch, faults=(), seed=0):
         import serial
 
-        super().__init__(faults, seed, watchdog)
+        super().__init__(faults, seed)
         clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.wait)
         monkeypatch.setattr("dexsim_real.wire.serial_hand.time", clock)
         monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(self, timeout))

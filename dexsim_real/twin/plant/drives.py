@@ -4,9 +4,9 @@
 
 The firmware closes its loop at 1 kHz on the encoder, which is on the rotor's side of the gear. The units of its gains
 are not published. Here a kp of 100, the bridge's default, is the nominal stiffness of training, 3 Nm/rad, on every
-joint. A kd of 0 leaves the damping of the winding (back-EMF), 0.1 Nm s/rad, in the middle of training's range; a kd of
-100 adds the same again. A `torque_max` of 300, the bridge's default, allows 1 A, the stall current; real hands stalled
-at 300 report 0.8 to 1.5 A.
+joint. The damping is that of the winding (back-EMF), 0.1 Nm s/rad, in the middle of training's range; ki and kd, which
+the bridge leaves at 0, have no effect. A `torque_max` of 300, the bridge's default, allows 1 A, the stall current; real
+hands stalled at 300 report 0.8 to 1.5 A.
 """
 
 import collections
@@ -18,15 +18,12 @@ from dexsim_real.twin.plant.parameters import EXCHANGE_COMMAND, TrialParameters
 from dexsim_real.wire.frames import Mode
 
 STIFFNESS = 3.0 / 100  # Nm/rad per unit of kp
-INTEGRAL = 0.3 / 100  # Nm/(rad s) per unit of ki
-DAMPING = 0.1 / 100  # Nm s/rad per unit of kd
-BACK_EMF = 0.1  # Nm s/rad, damping at kd = 0
+BACK_EMF = 0.1  # Nm s/rad
 STALL_CURRENT = 1.0  # A at torque_max = 300, cold
 FULL_TORQUE_MAX = 300.0
 PERIOD = 0.001  # s of the firmware's loop
 _HEAT_STEPS = 10  # periods between two updates of the temperature
-_SPEED_TIME = 0.002  # s, the firmware's filter on the encoder's speed
-_FIELDS = ("position", "kp", "ki", "kd", "torque_max", "mode")
+_FIELDS = ("position", "kp", "torque_max", "mode")
 _AT_REST = 0.05  # rad/s, speed within which the no-load current changes its sign
 
 
@@ -63,9 +60,7 @@ class Drives:
         self.current = zero.copy()  # A, true
         self._queue: collections.deque[tuple[np.ndarray, np.ndarray]] = collections.deque()
         self._next = np.inf  # s, when the next command reaches a board
-        self._integral, self._speed = zero.copy(), zero.copy()
-        self._last: np.ndarray | None = None
-        self._on, self._limit, self._max_torque = np.zeros(joints, bool), zero.copy(), zero.copy()
+        self._on, self._limit = np.zeros(joints, bool), zero.copy()
         self._highest = self._lowest = zero  # A, of the last period
 
     def configure(self, parameters: TrialParameters) -> None:
@@ -119,27 +114,15 @@ class Drives:
         while self._queue and time >= self._queue[0][0].max():
             self._queue.popleft()
         self._next = min((there[there > time].min() for there, _ in self._queue), default=np.inf)
-        self._on = self._board[5] == Mode.POSITION
-        self._limit = self._board[4] / FULL_TORQUE_MAX * STALL_CURRENT
-        self._max_torque = self._limit * self.constant
+        _, _, torque_max, mode = self._board
+        self._on = mode == Mode.POSITION
+        self._limit = torque_max / FULL_TORQUE_MAX * STALL_CURRENT
 
     def _current(self, rotor: np.ndarray, speed: np.ndarray) -> np.ndarray:
         if not self._on.any():
-            self._integral[:], self._last = 0.0, None
             return np.zeros_like(speed)
-        position, kp, ki, kd, _, _ = self._board
-        encoder = rotor + self.bias
-        error = position - encoder
-        torque = self.stiffness * kp * error - self.emf * speed
-        if ki.any():
-            more = PERIOD * INTEGRAL * ki * error
-            self._integral = np.clip(self._integral + more, -self._max_torque, self._max_torque)
-            torque += self._integral
-        if kd.any():  # This damping acts on the firmware's speed estimate, the back-EMF on the true speed.
-            rate = speed if self._last is None else (encoder - self._last) / PERIOD
-            self._last = encoder
-            self._speed += PERIOD / (PERIOD + _SPEED_TIME) * (rate - self._speed)
-            torque -= DAMPING * kd * self._speed
+        position, kp, *_ = self._board
+        torque = self.stiffness * kp * (position - (rotor + self.bias)) - self.emf * speed
         # Current that the supply can drive against the back-EMF: less in the direction of motion, more against it.
         share = speed / self.no_load_speed
         highest = np.minimum(np.maximum(self._stalled * (1.0 - share), 0.0), self._limit)

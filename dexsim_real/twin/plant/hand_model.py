@@ -210,12 +210,13 @@ def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int,
 
 def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Pose, tips: list[int]) -> None:
     """Check where the fingertips are with all joints at 0, and with each at its upper end."""
-    data = mujoco.MjData(model)
+    data, reference = mujoco.MjData(model), mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
     for j in range(-1, hand.num_joints):
         posture = np.where(np.arange(hand.num_joints) == j, hand.joint_upper, 0.0)
         data.qpos[model.jnt_qposadr[joints]] = posture
         mujoco.mj_kinematics(model, data)
-        apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - _hand_tips(hand, posture)[0], axis=-1)
+        expected, _ = _hand_tips(hand, reference, posture)
+        apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - expected, axis=-1)
         if not apart.max() <= _APART:
             where = f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad" if j >= 0 else "all joints at 0"
             raise ValueError(
@@ -224,9 +225,8 @@ def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Po
             )
 
 
-def _hand_tips(hand: Hand, posture: np.ndarray) -> Pose:
-    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's own MJCF."""
-    data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
+def _hand_tips(hand: Hand, data: mujoco.MjData, posture: np.ndarray) -> Pose:
+    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by `data` of the hand's MJCF."""
     for name, angle in zip(hand.joint_names, posture, strict=True):
         data.joint(name).qpos[0] = angle
     mujoco.mj_kinematics(data.model, data)
@@ -238,7 +238,8 @@ def _hand_tips(hand: Hand, posture: np.ndarray) -> Pose:
 
 def _add_lattices(spec: mujoco.MjSpec, data: mujoco.MjData, hand: Hand, palm: Pose, tips: list[int]) -> list[str]:
     """Add the frames of the taxels: at the tip sites, turned as on the hand with all joints at 0 (as in `data`)."""
-    turns = palm[1] @ _hand_tips(hand, np.zeros(hand.num_joints))[1]
+    reference = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
+    turns = palm[1] @ _hand_tips(hand, reference, np.zeros(hand.num_joints))[1]
     names = [f"lattice_{finger}" for finger in hand.finger_names]
     for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
         body, quat = int(data.model.site_bodyid[site]), np.empty(4)

@@ -1,4 +1,4 @@
-"""The emulated palm board: action and answer for each command, and the watchdog.
+"""The emulated palm board: action and answer for each command.
 
 Answers have the layouts of `dexsim_real.wire.frames`. It has the commands that the bridge sends, and refuses others. No
 public source describes the meaning of the error bits: they are defined here.
@@ -16,8 +16,8 @@ from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
 from dexsim_real.wire.serial_hand import passive_command
 
-OVERHEATED, ABANDONED = 1, 4
-"""Error bits of a joint, defined by this board: too hot and off, no host."""
+OVERHEATED = 1
+"""Error bit of a joint, defined by this board: too hot and off."""
 VERSION = "1.3.9 emulated"
 SERIALS = {"right": "2R32EMULATED", "left": "2L32EMULATED"}
 FORCE_PER_COUNT = 0.1  # N of one taxel count
@@ -38,44 +38,23 @@ class Firmware:
 
     Args:
       plant: the physics.
-      watchdog: s without a valid exchange after which the motors go off; 0: never.
       note: called with one line when the motors turn on or off.
     """
 
-    def __init__(self, plant: EmulatedHand, watchdog: float = 0.0, note: Callable[[str], None] = lambda text: None):
-        self.plant, self.watchdog, self._note = plant, watchdog, note
+    def __init__(self, plant: EmulatedHand, note: Callable[[str], None] = lambda text: None):
+        self.plant, self._note = plant, note
         side = plant.hand.side
         self._registers = {SERIAL_NUMBER.to_bytes(2, "little"): SERIALS[side], SIDE.to_bytes(2, "little"): side}
         self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = passive_command()  # `frames.COMMAND_BLOCK` that the joints execute
         self.faults: list[tuple[float, Fault]] = []  # that last now, and until when (s)
         self.angles = np.zeros(frames.JOINTS)  # rad, true angles of the last state sent
-        self.trips: list[float] = []  # s, times at which the watchdog acted
-        self._alive = -np.inf  # s, time of the last valid exchange
         self._hot = np.zeros(frames.JOINTS, bool)
-        self._abandoned = False
 
     @property
     def on(self) -> bool:
         """Whether any motor is on."""
         return bool(np.any(self.motors["mode"] != Mode.PASSIVE))
-
-    @property
-    def deadline(self) -> float:
-        """Time s at which the watchdog acts without another exchange; infinite if it does not."""
-        return self._alive + self.watchdog if self.on and self.watchdog else np.inf
-
-    def watch(self, now: float) -> bool:
-        """Turn the motors off if the last exchange is too long ago; returns whether it did."""
-        if now < self.deadline:
-            return False
-        self.trips.append(now)
-        self._abandoned = True
-        motors = self.motors.copy()
-        motors["mode"] = Mode.PASSIVE
-        self._drive(motors)
-        self._note(f"watchdog: no exchange for {1e3 * (now - self._alive):.0f} ms, motors off")
-        return True
 
     def begin(self, fault: Fault, now: float) -> None:
         """Begin a fault of the board at a time in s; it ends by itself."""
@@ -91,7 +70,7 @@ class Firmware:
         asked = command = Command(frame.command)
         try:
             if asked == Command.EXCHANGE:
-                data = self._exchange(frame.data, now)
+                data = self._exchange(frame.data)
             elif asked == Command.VERSION:
                 data = VERSION.encode()
             elif asked == Command.READ_REGISTER and frame.data[:2] in self._registers:
@@ -114,7 +93,7 @@ class Firmware:
         raw = (np.round(joint["position"] / _TICK).astype(int) + 2048) & 0xFFF
         joint["raw_position"] = raw << 4 | self.motors["mode"]
         joint["temperature"] = _PALM << 8 | _whole(self._temperature(measured), np.uint8).astype(np.uint16)
-        joint["joint_error"] = OVERHEATED * self._hot + ABANDONED * self._abandoned
+        joint["joint_error"] = OVERHEATED * self._hot
         counts = np.round(measured.taxel_force / FORCE_PER_COUNT).astype(np.int32)
         tip["taxel_temperature"] = tip["temperature"] = _TIP
         for fault in self._lasting("stuck"):
@@ -138,7 +117,7 @@ class Firmware:
                 tip["temperature"][int(fault.part[3:])] += np.uint8(fault.kelvin)
         return block
 
-    def _exchange(self, data: bytes, now: float) -> bytes:
+    def _exchange(self, data: bytes) -> bytes:
         try:
             block = frames.decode_command(data)
         except frames.FrameError:
@@ -156,7 +135,6 @@ class Firmware:
         measured = self.plant.measure()
         hot = self._temperature(measured)
         self._hot = (hot > SHUTDOWN) | (self._hot & (hot > SHUTDOWN - 10.0))
-        self._alive, self._abandoned = now, False
         self._command(block)
         self.angles = _angles(measured)
         return self.state(measured).tobytes()
@@ -179,13 +157,10 @@ class Firmware:
             block["mode"][slice(None) if fault.joint == ALL else fault.joint] = Mode.PASSIVE
         for fault in self._lasting("jam"):
             block["position"][fault.joint] = fault.radians
-        self._drive(block)
+        self.motors = block
+        self.plant.drive(block)
         if was_on != self.on:
             self._note("motors on" if self.on else "motors off")
-
-    def _drive(self, motors: np.ndarray) -> None:
-        self.motors = motors
-        self.plant.drive(motors)
 
 
 def _angles(measured: PlantMeasurement) -> np.ndarray:

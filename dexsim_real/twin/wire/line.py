@@ -7,7 +7,6 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 
 import contextlib
 import os
-import termios
 import tty
 from collections import Counter, deque
 from collections.abc import Callable
@@ -28,7 +27,6 @@ PROCESSING, JITTER = 0.00120, 0.00002  # s from a request's last byte to its ans
 EXTRA_DELAY, EXTRA_PROBABILITY = 0.0011, 0.01  # s, largest extra delay of an exchange; how often there is one
 CHUNK = 510  # bytes that the adapter forwards at once
 _SILENCE = 0.003  # s without a byte after which an incomplete request is dropped
-_RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 
 
 class Terminal:
@@ -78,11 +76,6 @@ class Terminal:
     @property
     def connected(self) -> bool:
         return self._master >= 0
-
-    @property
-    def baud(self) -> int | None:
-        """Baud rate set by the other side; None if unknown."""
-        return _RATES.get(termios.tcgetattr(self._slave)[5])
 
     def fileno(self) -> int:
         return self._master
@@ -137,7 +130,7 @@ class HandLine:
         """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
         if self._answer:
             return min(self._answer[0][0], self._back)
-        return min(self._request[0] if self._request else self.firmware.deadline, self._back)
+        return min(self._request[0] if self._request else np.inf, self._back)
 
     def serve(self, now: float) -> None:
         """Do what is due."""
@@ -147,9 +140,7 @@ class HandLine:
             self._note("reconnected")
         if self.terminal.connected:
             self._listen(now)
-        if not self._request:  # A request that has arrived counts, even if this machine is late to serve it.
-            self.firmware.watch(now)
-        elif self._request[0] <= now:
+        if self._request and self._request[0] <= now:
             (due, frame), self._request = self._request, None
             self._act(now, due, frame)
         while self._answer and self._answer[0][0] <= now:
@@ -164,8 +155,6 @@ class HandLine:
                 self._parser.expire()
             return
         self._heard = now
-        if self.terminal.baud not in (BAUD, None):
-            return  # It understands nothing.
         for frame in self._parser.feed(data):
             self.counts["requests"] += 1
             if now < self._deaf or self._request or self._answer:  # It cannot listen and talk on one pair of wires.

@@ -23,9 +23,7 @@ from dexsim.core.errors import CalibrationError
 def side(gain, offset, largest):
     pair = np.ones((2, 12))
     lines = [pair * gain, pair * gain, pair * gain, pair * offset, pair * offset, pair * offset]
-    return Side(
-        *lines, 0.01 * pair, pair, 5 * pair, 50 * pair, 0 * pair, *(np.ones(12) * v for v in (0.02, largest, 8.0))
-    )
+    return Side(*lines, 0.01 * pair, pair, 50 * pair, *(np.ones(12) * v for v in (0.02, largest, 8.0)))
 
 
 @pytest.fixture(scope="module")
@@ -65,25 +63,16 @@ def refused(path, hand):
 
 WRONG = [
     ({"real.gain": -1e-9}, "thumb_bend: current of the full torque by real.gain = 2.75e-08"),
-    ({"real.gain": -1e9}, "thumb_bend: current of the full torque by real.gain = 2.75e.10"),
     ({"real.gain": [-0.05, 0.05]}, "thumb_bend: real.gain unloading over loading = -1: must be between"),
-    ({"real.gain": 0.0}, "thumb_bend: real.gain unloading over loading = nan"),
     ({"real.gain": np.nan}, "thumb_bend: real.gain"),
     ({"sim.gain": 1.0}, "thumb_bend: magnitude of sim.gain = 1: must .* 0.3 Nm/N"),
     ({"real.offset": 5.0}, "thumb_bend: share of the full torque without current"),
-    ({"real.offset": -5.0}, "thumb_bend: share of the full torque without current"),
-    ({"real.offset": np.inf}, "thumb_bend: share of the full torque without current"),
     ({"torque_scale": 0.9}, "thumb_bend: torque_scale over the hand's limit = 0.8182"),
-    ({"torque_scale": -1.1}, "thumb_bend: torque_scale = -1.1: must be between 0.01 and 20 Nm"),
     ({"real.force_max": 1000.0}, "thumb_bend: real.force_max = 1000: .* 100 N"),
     ({"real.value_max": 100.0}, "thumb_bend: real.value_max = 100: .* 33 A"),
     ({"force_per_count": 1e-9}, "thumb: force_per_count = 1e-09: must be between 0.001 and 1 N"),
-    ({"force_per_count": -0.1}, "thumb: force_per_count = -0.1: "),
-    ({"force_per_count": 10.0}, "thumb: force_per_count = 10: "),
-    ({"current_per_count": np.inf}, "current_per_count = inf: "),
     ({"current_per_count": 0.05}, "current_per_count = 0.05: .* 0.001"),
     ({"force_per_torque": 0.5}, "thumb: force_per_torque = 0.5: .* N/Nm"),
-    ({"force_per_torque": np.nan}, "thumb: force_per_torque = nan: "),
     # Each line goes with the simulation's of its own direction, but not with the middle of both, which is used.
     (
         {"sim.gain": [0.0001, 0.3], "real.gain": [0.0029, 0.0085], "real.offset": [31.0, 0.03]},
@@ -111,7 +100,6 @@ DAMAGED = [
     ("friction = ", "fiction = ", "unknown entry 'fiction'"),
     ("version = 2", "version = 1", "it has version 1, this library reads 2"),
     ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
-    ("complete = true", "complete = false", "its end is missing"),
     ('"thumb_bend"', '"thumb_bent"', "calibrate this hand"),
     ("xhand_right", "x" * 5000, "is of hand 'x+"),
     ("[real]", "real = 1\n[other]", "damaged"),

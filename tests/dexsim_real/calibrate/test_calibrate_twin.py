@@ -8,13 +8,11 @@ import time
 
 import mujoco
 import numpy as np
-import press_bench
 import pytest
-from calibrating import arguments, operator, record
+from calibrating import Typist, arguments, operator, record
 from paths import ROOT
 
 from dexsim.calibration.maps import load_calibration
-from dexsim_real.calibrate import person
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.press_fit import torque_constants
@@ -37,14 +35,12 @@ def errors(calibration, truth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, monkeypatch, seed):
+def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
     """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
     from press_plant import PressBench
 
     from dexsim_real.twin.virtual import VirtualPort
 
-    # On a busy machine the hand would go on while the gauge, in its thread, reads the physics.
-    monkeypatch.setattr(person, "_AT_ONCE", 60.0)
     plant, pressed = PressBench(hand, seed), []
 
     def gauge():
@@ -52,9 +48,8 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, monke
         return plant.gauge()
 
     bench = VirtualPort(plant)
-    monkeypatch.setattr(press_bench, "GAUGE", gauge)
-    options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
-    fit_and_report(options, hand, [record(bench, hand, options)], operator())
+    options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge=True, yes=False)
+    fit_and_report(options, hand, [record(bench, hand, options, Typist(gauge).operator())], operator())
     calibration, truth = load_calibration(options.output, hand), plant.truth()
     error = errors(calibration, truth)
     # Its motors warm up by 15 K and so lose 1.5 %; ripple is 3 %; contact and taxels differ by a millimetre.

@@ -1,6 +1,5 @@
 """The log: what goes in comes out, whatever happens to the program or to the file."""
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -8,7 +7,6 @@ import sys
 import time
 import zlib
 
-import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -69,41 +67,17 @@ def test_damage_costs_the_damaged_record_only(small, tmp_path_factory, data):
     assert got <= {f"note {i}" for i in range(20)} and len(got) == 19 and reader.damaged > 0
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"\xc1",
-        b"\xdf\xff\xff\xff\xff",
-        msgpack.packb(5),
-        msgpack.packb([1, 0.0]),
-        msgpack.packb([99, 0.0, "no kind"]),
-        msgpack.packb([4, 0.0, {"a": {"__array__": "O", "shape": [1], "data": b"12345678"}}]),
-        msgpack.packb([4, 0.0, {"a": {"__array__": "<f4", "shape": [99], "data": b"1234"}}]),
-        msgpack.packb([4, 0.0, {"a": {"__array__": "no type", "shape": [1], "data": b"1234"}}]),
-    ],
-)
-def test_a_record_that_cannot_be_decoded_counts_as_damage(tmp_path, payload):
-    """With a right checksum."""
-    bad, path = _HEAD.pack(SYNC, len(payload), zlib.crc32(payload)) + payload, tmp_path / "run.log"
-    path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + bad + encode(Kind.NOTE, 0.0, "after"))
-    reader = LogReader(path)
-    assert [record.content for record in reader] == ["before", "after"] and reader.damaged == len(bad)
-
-
-@pytest.mark.parametrize("length", [4_000_000, 50_000_000])
-def test_a_forged_log_costs_time_in_proportion_to_its_size(tmp_path, monkeypatch, length):
+def test_a_forged_log_costs_time_in_proportion_to_its_size(tmp_path, monkeypatch):
     """Heads everywhere, each of which claims megabytes: checksums over all of them would be quadratic."""
-    summed = []
-    real = zlib.crc32
-    monkeypatch.setattr(zlib, "crc32", lambda data, *start: summed.append(len(data)) or real(data, *start))
-    heads, path = _HEAD.pack(SYNC, length, 0) * 300_000, tmp_path / "run.log"
-    path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + heads)
-    summed.clear()
-    got = []
-    with contextlib.suppress(LogError):
-        for record in LogReader(path):
-            got.append(record.content)
-    assert got == ["before"] and sum(summed) < 6 * path.stat().st_size
+    summed, crc32 = [], zlib.crc32
+    path = tmp_path / "run.log"
+    path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + _HEAD.pack(SYNC, 4_000_000, 0) * 400_000)
+    monkeypatch.setattr(zlib, "crc32", lambda data: summed.append(len(data)) or crc32(data))
+    records = iter(LogReader(path))
+    assert next(records).content == "before"
+    with pytest.raises(LogError, match="nearly all of it is damaged"):
+        next(records)
+    assert 4_000_000 < sum(summed) < 6 * path.stat().st_size
 
 
 def test_files_that_are_no_log(tmp_path):

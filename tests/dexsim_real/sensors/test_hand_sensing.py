@@ -68,7 +68,7 @@ def test_current_without_and_with_a_calibration(hand, tmp_path):
 
     def side(gain, offset):
         pair, one = np.ones((2, 12)), np.ones(12)
-        return Side(pair * gain, pair, pair, pair * offset, *[pair] * 7, one, one, one)
+        return Side(pair * gain, pair, pair, pair * offset, *[pair] * 5, one, one, one)
 
     # current = -0.05 F - 0.02 A and torque = 0.04 F Nm, so torque = -0.8 (current + 0.02).
     calibration = Calibration(

@@ -93,7 +93,6 @@ def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):
     for options, says in (
         ("--faults 5,melt", "give a time in s or a percentage"),
         ("--task juggle", "choose from grasp, rotate"),
-        ("--watchdog 20", "between 0 and 10"),
         (f"--link {tmp_path}/no/port", "no pseudo-terminal"),
         (f"--task grasp --mask-socket {tmp_path}/no/m", "socket for masks cannot be created"),
         (f"--task grasp --mask-socket {tmp_path}/there", "remove the file"),

@@ -32,18 +32,6 @@ def test_a_step_follows_the_second_order_closed_form(hand):
     assert angle == pytest.approx(np.full(12, step), abs=1e-3 * step)
 
 
-def test_a_load_costs_a_steady_error_that_integral_action_removes(hand):
-    for ki, rest in ((0.0, 0.2 / 3.0), (100.0, 0.0)):
-        made, inertia = drives(hand), 2e-3
-        made.send(0.0, motors(0.5, ki=ki))
-        angle, speed = np.zeros(12), np.zeros(12)
-        for k in range(60000 if ki else 2000):
-            torque, _ = made.step(k * PERIOD, angle, speed)
-            speed = speed + PERIOD * (torque - 0.2) / inertia
-            angle = angle + PERIOD * speed
-        assert 0.5 - angle == pytest.approx(np.full(12, rest), abs=1e-3)
-
-
 def test_current_at_a_static_torque_and_its_limits(hand):
     made = drives(hand)
     made.send(0.0, motors(0.1))

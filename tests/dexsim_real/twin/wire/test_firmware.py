@@ -1,4 +1,4 @@
-"""The emulated palm board: answers, quantisation, protection, watchdog."""
+"""The emulated palm board: answers, quantisation, protection."""
 
 import math
 import struct
@@ -12,7 +12,7 @@ from twin_plant import ScriptedPlant
 
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.wire.faults import Fault
-from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware
+from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 
@@ -84,23 +84,3 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]
-
-
-def test_without_an_exchange_the_motors_go_off():
-    plant, notes = ScriptedPlant(), []
-    board = Firmware(plant, 0.09, notes.append)
-    assert board.deadline == math.inf and not board.watch(1e6)
-    ask(board, Command.EXCHANGE, command().tobytes(), now=5.0)
-    assert board.deadline == pytest.approx(5.09) and not board.watch(5.0899) and board.on
-    # Neither a request for the version nor a refused command keeps them on.
-    ask(board, Command.VERSION, now=5.08)
-    ask(board, Command.EXCHANGE, command(mode=7).tobytes(), now=5.08)
-    assert board.watch(5.0901) and not board.on and plant.motors["mode"].tolist() == [0] * 12
-    assert board.trips == [5.0901] and "no exchange for 90 ms" in notes[-1] and not board.watch(6.0)
-    assert (board.state(plant.measure())["joint"]["joint_error"] == ABANDONED).all()
-    state = ask(board, Command.EXCHANGE, command(mode=Mode.PASSIVE).tobytes(), now=7.0)
-    assert not frames.decode_state(state.data)["joint"]["joint_error"].any()
-    # By default there is none: what the real hand does is not known.
-    board = Firmware(plant)
-    ask(board, Command.EXCHANGE, command().tobytes(), now=5.0)
-    assert board.deadline == math.inf and not board.watch(1e6) and board.on and board.trips == []
