@@ -36,8 +36,10 @@ class CalibrateArguments(Config):
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None
-    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION. None only with
-    --from-log."""
+    """Serial port of the XHand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION for the driver of
+    another hand (docs/bridge.md). None only with --from-log."""
+    hand: str = ""
+    """The TOML of a hand of your own, or a shipped name; empty for the XHand."""
     output: Path | None = None
     """Output file; None for hand.toml, or hand.json with --identify."""
     force: bool = False
