@@ -20,9 +20,11 @@ from dexsim_real.wire.link import LinkConfig, LinkCounts, Refusal, Reply
 NEWTONS_PER_COUNT = 0.1  # of the blocks' taxel counts; the default of `--hardware.force-per-count`
 _PAUSE = 0.002  # s, of a call while the hand is gone
 WITHOUT = {
-    "taxels": "no taxels: --safety.finger-force and --safety.total-force are off, calibrate has only --identify",
-    "currents": "no currents: --safety.current, --safety.stall-current and the check that joints follow their commands "
-    "are off, calibrate has only --identify without a calibration",
+    "taxels": "no taxels: policies cannot observe contact_force, contact_centre or finger_force; --safety.finger-force"
+    " and --safety.total-force are off; calibrate has only --identify",
+    "currents": "no currents: policies cannot observe joint_torque and finger_force; --safety.current, "
+    "--safety.stall-current and the check that joints follow their commands are off; calibrate has only --identify, "
+    "and finds no torques",
     "temperatures": "no temperatures: --safety.temperature is off",
 }
 """What the bridge cannot do without a measurement, by its name in `HandDriver.measures`."""
@@ -166,8 +168,8 @@ class DriverPort:
         self.counts.sent += 1
         sent, on = self._clock(), bool(np.all(command["mode"] == Mode.POSITION))
         self._tap("tx", Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes()).encode())
-        gains = (command[name].astype(float) for name in ("kp", "ki", "kd"))
-        self.driver.send(JointTargets(command["position"].astype(float), on, *gains, command["torque_max"] * 1e-3))
+        kp, ki, kd = (command[name].astype(float) for name in ("kp", "ki", "kd"))
+        self.driver.send(JointTargets(command["position"].astype(float), on, kp, ki, kd, command["torque_max"] * 1e-3))
         state = self.driver.read()
         received = self._clock()
         if state is None:
@@ -209,9 +211,9 @@ def _checked(
     """An array of a `DriverState`; `absent` in every place of one that the hand does not measure."""
     if not measured:
         return np.full(shape, absent)
-    if np.shape(value) != shape:
-        raise HandError(f"the driver's {name} has the shape {list(np.shape(value))}, expected {list(shape)}")
     array = np.asarray(value)
+    if array.shape != shape:
+        raise HandError(f"the driver's {name} has the shape {list(array.shape)}, expected {list(shape)}")
     if not np.isfinite(array).all():
         raise HandError(f"the driver's {name} is not finite; `read` returns None where it has no whole state")
     return array

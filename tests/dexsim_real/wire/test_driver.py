@@ -155,6 +155,7 @@ def test_what_a_hand_does_not_measure_is_said_in_a_line_each(leap):
     lines = greet(DriverPort(Scripted(leap, ["currents"]), leap, LinkConfig()))
     assert [line.split(":")[1] for line in lines[1:]] == [" no taxels", " no temperatures"]
     assert "--safety.finger-force" in lines[1] and "--safety.temperature" in lines[2]
+    assert all(field in WITHOUT[need] for field, needs in NEEDS.items() for need in needs)
 
 
 @pytest.mark.parametrize(
