@@ -144,7 +144,9 @@ class ObservationConfig(Config):
     """Contact centre weighted by taxel force, or the plain mean of the active taxels."""
     orientation: str = setting("6d", choices=("6d", "quaternion"))
     """Encoding of the relative target orientation."""
-    leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre", "relative_orientation"))
+    leave_out: tuple[str, ...] = setting(
+        (), choices=("joint_torque", "contact_force", "contact_centre", "relative_orientation")
+    )
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=FIELDS)
     """Measured fields beyond the task's own, for actor and critic."""

@@ -14,13 +14,16 @@ if TYPE_CHECKING:
     from dexsim_real.control.safety import Safety
     from dexsim_real.core.errors import HandError
     from dexsim_real.run.session import RunResult, run_policy
-    from dexsim_real.wire.link import HandPort, LinkConfig
+    from dexsim_real.wire.driver import DriverState, HandDriver, JointTargets
+    from dexsim_real.wire.link import LinkConfig
     from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 __all__ = [
     "Controller",
+    "DriverState",
+    "HandDriver",
     "HandError",
-    "HandPort",
+    "JointTargets",
     "LinkConfig",
     "RunResult",
     "Safety",
@@ -35,8 +38,10 @@ __getattr__, __dir__ = lazy_exports(
     __all__,
     {
         "Controller": "dexsim_real.control.controller",
+        "DriverState": "dexsim_real.wire.driver",
+        "HandDriver": "dexsim_real.wire.driver",
         "HandError": "dexsim_real.core.errors",
-        "HandPort": "dexsim_real.wire.link",
+        "JointTargets": "dexsim_real.wire.driver",
         "LinkConfig": "dexsim_real.wire.link",
         "RunResult": "dexsim_real.run.session",
         "Safety": "dexsim_real.control.safety",

@@ -19,7 +19,7 @@ from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, Reply, checked, refusal_of
+from dexsim_real.wire.link import HandPort, Reply, refusal_of
 
 TARE_SAMPLES = 30
 _TARE = 5.0  # s in which they must arrive
@@ -30,7 +30,7 @@ class Exchange(NamedTuple):
 
     decision: SafetyDecision  # what was sent
     sample: HandSample
-    state: np.ndarray  # `frames.STATE_BLOCK`
+    state: np.ndarray  # `frames.STATE_BLOCK` or `frames.driver_block`
     plausible: bool  # whether `Safety` takes the sample for a measurement
 
 
@@ -65,7 +65,7 @@ class ExchangeLoop:
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self.track_taxels = track_taxels
-        self._filter = VelocityFilter()
+        self._filter = VelocityFilter(sensing.hand.num_joints)
         self._generation: int | None = None
         self._engage = False
 
@@ -80,7 +80,7 @@ class ExchangeLoop:
         return self.take(decision, self.port.exchange(command))
 
     def request(self) -> tuple[SafetyDecision, np.ndarray]:
-        """What to send now, and its `frames.COMMAND_BLOCK`."""
+        """What to send now, and its joint commands (`frames.command_block`)."""
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -93,7 +93,6 @@ class ExchangeLoop:
         if reply is None:
             self.safety.refuse(refusal_of(self.port))
             return None
-        reply = checked(reply, self.clock())
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)

@@ -50,6 +50,7 @@ FLOORS = {
         ("control",),
         ("loop",),
         ("run", "replay", "calibrate"),
+        ("ros",),
         ("twin.plant",),
         ("twin.wire",),
         ("twin",),

@@ -17,7 +17,8 @@ NAMES = {
         CurriculumConfig PPOConfig Policy TrainResult TrainState act evaluate_policy load_policy make_train train_policy
     """,
     "dexsim_real": """
-        Controller HandError HandPort LinkConfig RunResult Safety SafetyConfig SerialHand open_port run_policy
+        Controller DriverState HandDriver HandError JointTargets LinkConfig RunResult Safety SafetyConfig SerialHand
+        open_port run_policy
     """,
 }
 

@@ -10,11 +10,11 @@ from dexsim.view.source import Control, Frame, Slider, Values
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
 from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.wire.serial_hand import check_wire
 
 
 class Emulation:

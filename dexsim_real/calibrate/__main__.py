@@ -132,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             cli.check_writable(path)
     prepare_jax()
     cli.enable_caches()
-    hand = load_hand(arguments.hand)
+    hand = load_hand(arguments.hand or None)
     operator = Operator(Console(stderr=True), assume_yes=arguments.yes)
     if arguments.identify:
         identify_hand(arguments, hand, operator)

@@ -23,7 +23,7 @@ from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.loop import Exchange, ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import HandPort, greet
+from dexsim_real.wire.link import HandPort, greet, missing_of
 from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
@@ -56,7 +56,11 @@ class Bench(ExchangeLoop):
         sensing = HandSensing(hand, arguments.hardware)
         if port is None:
             assert arguments.port is not None, "`CalibrateArguments` asks for it"
-            port = open_port(arguments.port, arguments.link)
+            port = open_port(arguments.port, hand, arguments.link)
+        if not arguments.identify and (lacking := [name for name in missing_of(port) if name != "temperatures"]):
+            raise HandError(
+                f"presses need taxels and currents, and the hand has no {' and no '.join(lacking)}: --identify"
+            )
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log"))
         safety = Safety(hand, arguments.safety, self._react)
         super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, clock=clock, sleep=sleep)

@@ -27,6 +27,7 @@ from dexsim_real.calibrate.read import Source, read_logs
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
+from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire import frames
 from dexsim_real.wire.identity import check_identity
 
@@ -167,9 +168,10 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
         )
     # Few samples are missing: interpolate them.
     rows = np.arange(len(marks))
-    state = np.array([frames.decode_state(mark["answer"])["joint"] for mark in marks if mark["measured"]])
-    sign, offset = source.hardware.joint_sign[joint], source.hardware.joint_offset[joint]
-    command = np.array([frames.decode_command(mark["command"])["position"] for mark in marks])
+    sensing = HandSensing(hand, source.hardware)
+    state = np.array([sensing.decode(mark["answer"])["joint"] for mark in marks if mark["measured"]])
+    command = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
+    sign, offset = float(sensing.sign[joint]), float(sensing.offset[joint])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     torque = None
     if calibration is not None:

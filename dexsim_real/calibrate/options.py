@@ -36,8 +36,8 @@ class CalibrateArguments(Config):
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None
-    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION. None only with
-    --from-log."""
+    """Serial port of the XHand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION for the driver of
+    another hand (docs/bridge.md). None only with --from-log."""
     hand: str = ""
     """The TOML of a hand, or the name of a shipped one (`xhand_left`); empty for the right XHand."""
     output: Path | None = None

@@ -13,12 +13,15 @@ import dataclasses
 import numpy as np
 
 from dexsim.calibration.press import lever_arms
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim_real.control.alarms import finger_joints
 from dexsim_real.core.errors import HandError
 
 _OPEN = 0.1  # rad, of the joints that do not press
 _SHARE = 0.3  # of the longest lever arm, above which a joint takes part
-_SIDES = {0: "palm's normal", 1: "thumb"}  # fingers with a joint that spreads them, and where that side faces
+_SPREADS = "index_bend"  # joint of the XHand: other hands are pressed on their pads alone
+_SIDES = {0: "palm's normal", 1: "thumb"}  # its fingers with a joint that spreads them, and where that side faces
+_BENT = (0.3, 0.3, 0.2), (0.35, 0.2)  # rad, joints of the pressing thumb, and of another finger, from the root on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +55,12 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     plan = []
     for finger in sorted(selected, key=lambda i: i == 0):
         # Bent a little more than the others.
-        first, name = int(hand.root_joint[finger]), hand.finger_names[finger]
-        bent = {0: 0.3, 1: 0.3, 2: 0.2} if finger == 0 else {first: 0.35, first + 1: 0.2}
+        name = hand.finger_names[finger]
+        joints = finger_joints(hand, 0) if finger == 0 else flexion_joints(hand, range(finger, finger + 1)).tolist()
+        bent = dict(zip(joints, _BENT[finger > 0], strict=False))
         task = f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it"
         plan.append(_placement(hand, f"{name} pad", finger, middle, bent, task))
-    for finger in [i for i in selected if sides and i in _SIDES]:
+    for finger in [i for i in selected if sides and i in _SIDES and _SPREADS in hand.joint_names]:
         name = hand.finger_names[finger]
         # The index finger of a left hand has the sensor of a right one: its first columns face the thumb.
         column = 1 if finger == 1 and hand.side == "left" else columns - 2
@@ -70,7 +74,8 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
 def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict[int, float], task: str) -> Placement:
     """A press at the mean of these taxels; `bent` gives the angles rad of the joints that are not open."""
     posture = np.full(hand.num_joints, _OPEN)
-    posture[3] = 0.0
+    if _SPREADS in hand.joint_names:
+        posture[hand.joint_names.index(_SPREADS)] = 0.0
     posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     posture[list(bent)] = list(bent.values())
     arms = np.mean([lever_arms(hand, posture, finger, taxel) for taxel in taxels], 0)

@@ -12,7 +12,6 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.procedure import RELEASED, REST
 from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire.frames import decode_state
 from dexsim_real.wire.identity import Identity
 
 
@@ -111,7 +110,7 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> dict[str, Rec
         if press is not None and "gauge" in content:
             press.gauge[content["phase"]] = float(content["gauge"])
             continue
-        state = decode_state(content["answer"])
+        state = sensing.decode(content["answer"])
         shear = np.stack([state["tip"]["taxel"][axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
         if content["phase"] == REST:
             slant.append(shear)

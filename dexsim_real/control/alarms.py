@@ -101,7 +101,8 @@ class Alarms:
 
     def _stall(self, time: float, measured: HandMeasurement) -> str:
         position = measured.joint_position
-        fine = (measured.current <= self.config.stall_current) | (np.abs(position - self._stood) > _STILL)
+        # A current that is not measured (NaN) is above nothing.
+        fine = ~(measured.current > self.config.stall_current) | (np.abs(position - self._stood) > _STILL)
         since = np.full(len(position), time) if self._moved_at is None else np.where(fine, time, self._moved_at)
         self._moved_at, self._stood = since, np.where(since == time, position, self._stood)
         joint = int(since.argmin())

@@ -6,6 +6,7 @@ observation, and the same `move_target` applies the policy's action to the joint
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.sensors.imu import IDENTITY
-from dexsim_real.sensors.readings import ObjectEstimate, make_readings, sources_of
+from dexsim_real.sensors.readings import ObjectEstimate, check_measured, make_readings, sources_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +89,10 @@ class Controller:
         for _ in range(3):
             self.tick(idle, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
         self.start(joints)
+
+    def check_measured(self, missing: Sequence[str]) -> None:
+        """Raises HandError: the policy needs what the hand does not measure (`wire.driver.WITHOUT`)."""
+        check_measured(select_fields(self.spec.fields, self.spec.observation), self.spec.force_loop, missing)
 
     def start(self, target: np.ndarray) -> None:
         """Begin an episode with these joint targets [J] rad and no previous action."""

@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if first := report["first_difference"]:
         verdict = f"{report['observations_same']} of {ticks} observations agree; first difference: {first}"
     if missing := report["without_frame"]:
-        verdict += f"; {missing} ticks lack their frame (drivers given as sdk: log none)"
+        verdict += f"; {missing} ticks lack their frame"
     print(verdict)
     if arguments.output:
         cli.write_json(arguments.output, report)

@@ -84,7 +84,7 @@ class Replay:
     def _compare(self, time: float, tick: dict[str, Any], frame: bytes) -> None:
         # The exchange thread may have changed the tare before the tick's record was written.
         self._sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
-        measured = self._sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
+        measured = self._sensing.measure(self._sensing.decode(frame[frames.HEADER.size : -2]))
         # The hand's measurements are recomputed; camera, goal and command are taken from the log.
         again = {name: getattr(measured, name) for name in ("joint_position", "joint_torque", "taxel_force")}
         same = all(_same(value, tick["readings"][name]) for name, value in again.items())

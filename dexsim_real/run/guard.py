@@ -1,6 +1,6 @@
 """A second process that turns the motors off when the runner dies or freezes, whatever killed or stopped it.
 
-    python -m dexsim_real.run.guard PORT LINK
+    python -m dexsim_real.run.guard PORT LINK HAND
 
 `python -m dexsim_real.run` starts it. A pipe connects the two. While the motors may be on, the exchange thread writes
 signs of life to it, each with the seconds until the next one; the kernel closes it at the runner's death, even by
@@ -23,11 +23,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
 from dexsim_real.control.motors_off import UNCONFIRMED, turn_off
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
+from dexsim_real.wire.frames import passive_command
 from dexsim_real.wire.link import LinkConfig
-from dexsim_real.wire.serial_hand import open_port, passive_command
+from dexsim_real.wire.serial_hand import open_port
 
 _OFF = b"off"
 _STARTUP = 20.0  # s, longest start of the guard
@@ -48,10 +51,10 @@ _FROZEN = "the runner stood still, and was killed"
 class Guard:
     """The runner's end: starts the process for a port, as for `open_port`."""
 
-    def __init__(self, port: str, link: LinkConfig):
+    def __init__(self, port: str, link: LinkConfig, hand: Hand):
         root = str(Path(__file__).resolve().parents[2])
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "dexsim_real.run.guard", port, json.dumps(dataclasses.asdict(link))],
+            [sys.executable, "-m", "dexsim_real.run.guard", port, json.dumps(dataclasses.asdict(link)), hand.source],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -130,7 +133,7 @@ def main(argv: Sequence[str]) -> int:
     # What a driver prints must not be taken for an answer, nor fail once the runner is gone.
     answers = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    link = LinkConfig(**options | {"settle": 0.0, "backoff": _BACKOFF})
+    link, hand = LinkConfig(**options | {"settle": 0.0, "backoff": _BACKOFF}), load_hand(argv[2] or None)
     # Now, so that nothing must be loaded when it counts.
     module = port.removeprefix("sdk:").partition(":")[0] if port.startswith("sdk:") else "serial"
     with contextlib.suppress(ImportError):  # The runner says so.
@@ -141,7 +144,7 @@ def main(argv: Sequence[str]) -> int:
     if why == _FROZEN:
         _kill(runner, sys.stdin.fileno())
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):  # The terminal may be gone, too.
-        done = _stop(port, link)
+        done = _stop(port, link, hand)
     text = "motors off" if done else f"{UNCONFIRMED}; press the emergency stop"
     print(f"guard: {why}: {text}", file=sys.stderr, flush=True)
     return 0 if done else 1
@@ -178,14 +181,14 @@ def _kill(runner: int, pipe: int) -> None:
         pass
 
 
-def _stop(port: str, link: LinkConfig) -> bool:
+def _stop(port: str, link: LinkConfig, hand: Hand) -> bool:
     """Turn the motors off; returns whether the hand has confirmed it."""
     done, until, pause = False, time.monotonic() + _PATIENCE, _BACKOFF[0]
     while time.monotonic() < until:
         # Whatever somebody's own port does here, the next attempt may succeed.
-        with contextlib.suppress(Exception, SystemExit), contextlib.closing(open_port(port, link)) as hand:
-            hand.connect()
-            done = turn_off(hand, passive_command(), _ATTEMPT)
+        with contextlib.suppress(Exception, SystemExit), contextlib.closing(open_port(port, hand, link)) as line:
+            line.connect()
+            done = turn_off(line, passive_command(hand.num_joints), _ATTEMPT)
         if done:  # Also where the port could not be closed.
             return True
         time.sleep(pause)

@@ -22,7 +22,8 @@ class RunArguments(Config):
     policy: Annotated[str, tyro.conf.Positional]
     """Policy file, or name of a shipped policy ("grasp")."""
     port: str
-    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
+    """Serial port of the XHand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION for the driver of
+    another hand (docs/bridge.md)."""
     hand: str = ""
     """The TOML of a hand of your own, where it is not in the place that the policy's file names."""
     command: float = setting(0.5, unit="1", low=0.0, high=1.0)

@@ -38,9 +38,8 @@ from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.sensors.object_sensors import ObjectSensors
-from dexsim_real.wire.frames import empty_state
 from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import greet
+from dexsim_real.wire.link import greet, missing_of
 from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
@@ -75,7 +74,7 @@ def run_policy(
 
     Args:
       policy: file, or name of a shipped policy.
-      port: serial port of the hand, or sdk:MODULE:FUNCTION.
+      port: serial port of the XHand, or sdk:MODULE:FUNCTION for the driver of another hand.
       calibration: file of this hand; None for default scales.
       seconds: duration after the approach.
       options: further fields of `RunArguments`; `yes=True` asks nothing.
@@ -176,19 +175,20 @@ class Session:
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
         guarded = arguments.guard and not arguments.motors_off
-        self.guard = Guard(arguments.port, arguments.link) if guarded else None
         policy = load_policy(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
+        self.guard = Guard(arguments.port, arguments.link, hand) if guarded else None
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
+        self.port = open_port(arguments.port, hand, arguments.link, self._tap)
         self.controller = Controller(policy, calibrated_hand(hand, calibration))
+        self.controller.check_measured(missing_of(self.port))
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
         self.controller.warm()
-        self.sensing.measure(empty_state())
+        self.sensing.measure(np.zeros((), self.sensing.block))
         self.safety = Safety(hand, limits_for(arguments.safety, self.controller), self._react)
         # Not earlier: compiling in a real-time thread would starve the machine.
         realtime = arguments.realtime and use_realtime()
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log"))
-        self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         beat = self.guard.beat if self.guard else lambda more: None
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)

@@ -154,7 +154,7 @@ def _hand_tables(state: HandState) -> Table:
             f"{joint:2d} {name}",
             f"{measured.joint_position[joint]:.3f}",
             "-" if state.target is None else f"{state.target[joint]:.3f}",
-            f"{measured.current[joint]:.2f}",
+            "-" if np.isnan(measured.current[joint]) else f"{measured.current[joint]:.2f}",
             f"{heat[joint]:.0f}",
             *(f"{bits:04x}" if bits else "-" for bits in measured.errors[joint]),
         )

@@ -14,7 +14,6 @@ from dexsim_real.sensors.taxels import StuckTaxels, ZeroTracker, judge_rest, tax
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
-_JOINTS = frames.JOINTS
 _VELOCITY_TIME = 0.02  # s, time constant of the filter on differences of the joint angle
 _WANDERED = 30.0  # counts by which a fingertip's zero may move before a new tare is advised: 3 N by the vendor's 0.1 N
 
@@ -26,17 +25,18 @@ class HardwareConfig(Config):
     Check them on your own hand before you turn the motors on (docs/hardware.md).
     """
 
-    joint_sign: tuple[float, ...] = setting((1.0,) * _JOINTS, unit="1", low=-1.0, high=1.0)
-    """Direction of each joint relative to the model: 1 or -1. Public descriptions disagree about joint 3 (splay of the
-    index finger); in the model positive is toward the thumb."""
-    joint_offset: tuple[float, ...] = setting((0.0,) * _JOINTS, unit="rad", low=-1.0, high=1.0)
+    joint_sign: tuple[float, ...] = setting((1.0,), unit="1", low=-1.0, high=1.0)
+    """Direction of each joint relative to the model: 1 or -1; one value is for all joints, here and below. Public
+    descriptions disagree about joint 3 of the XHand (splay of the index finger); in the model positive is toward the
+    thumb."""
+    joint_offset: tuple[float, ...] = setting((0.0,), unit="rad", low=-1.0, high=1.0)
     """Added to the reported angle after the sign."""
-    kp: tuple[int, ...] = setting((100,) * _JOINTS, unit="1", low=0, high=5000)
-    """Position gain in an unpublished unit; 80 to 225 are in use."""
-    ki: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=-3000, high=3000)
-    """Integral gain in an unpublished unit."""
-    kd: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=0, high=12000)
-    """Damping gain in an unpublished unit; sources give a range of 0 to 5000 and use 12000."""
+    kp: tuple[int, ...] = setting((100,), unit="1", low=0, high=5000)
+    """Position gain, in an unpublished unit on the XHand, where 80 to 225 are in use."""
+    ki: tuple[int, ...] = setting((0,), unit="1", low=-3000, high=3000)
+    """Integral gain, likewise."""
+    kd: tuple[int, ...] = setting((0,), unit="1", low=0, high=12000)
+    """Damping gain, likewise; sources give a range of 0 to 5000 and use 12000."""
     torque_max: int = setting(300, unit="mA", low=0, high=1200)
     """Current limit sent with every command. Hands have reported currents far above it, so `--safety.current` limits
     the current as well."""
@@ -56,11 +56,15 @@ class HardwareConfig(Config):
 
     def __post_init__(self):
         super().__post_init__()
-        for name in ("joint_sign", "joint_offset", "kp", "ki", "kd"):
-            if len(getattr(self, name)) != _JOINTS:
-                raise HandError(f"HardwareConfig.{name}: {len(getattr(self, name))} values for {_JOINTS} joints")
         if any(abs(sign) != 1.0 for sign in self.joint_sign):
             raise HandError("HardwareConfig.joint_sign: every value must be 1 or -1")
+
+    def per_joint(self, name: str, joints: int) -> np.ndarray:
+        """A setting for each joint [J]. HandError: it has neither one value nor one a joint."""
+        values = getattr(self, name)
+        if len(values) not in (1, joints):
+            raise HandError(f"HardwareConfig.{name}: {len(values)} values for {joints} joints")
+        return np.broadcast_to(np.array(values), joints)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +74,8 @@ class HandMeasurement:
     joint_position: np.ndarray  # [J] rad
     joint_torque: np.ndarray  # [J] 1, relative to the stall torque
     taxel_force: np.ndarray  # [F, N] N
-    current: np.ndarray  # [J] A, magnitude
-    temperature: np.ndarray  # [J + F + 1] degC, joint boards, tips and palm board
+    current: np.ndarray  # [J] A, magnitude; NaN where the hand measures none
+    temperature: np.ndarray  # [J + F + 1] degC, joint boards, tips and palm board; 0 where it measures none
     errors: np.ndarray  # [J, 3] error bits of palm, joint and tip board
     mode: np.ndarray  # [J] control mode that the hand reports, `frames.Mode`
 
@@ -85,32 +89,24 @@ class HandMeasurement:
         return all(np.isfinite(part).all() for part in (self.joint_position, self.joint_torque, self.taxel_force))
 
 
-def check_wire(hand: Hand) -> None:
-    """Raises HandError: the hand has other joints or taxels than the frames carry."""
-    if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
-        raise HandError(
-            f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the frames "
-            f"carry {_JOINTS} and {frames.TIPS} x {frames.TAXELS}. Use the model of that hand"
-        )
-
-
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
 
     `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one. Without
-    a calibration of this hand the scales of `config` count. HandError: the model has other joints or taxels.
+    a calibration of this hand the scales of `config` count. HandError: `config` is for another number of joints.
     """
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
-        check_wire(hand)
         self.hand, self.config, self.calibration = hand, config, calibration
-        self._sign = np.array(config.joint_sign, np.float32)
-        self._offset = np.array(config.joint_offset, np.float32)
-        self.tare = np.zeros((frames.TIPS, frames.TAXELS), np.float32)
-        self._tared, self._advised = self.tare, np.zeros(frames.TIPS, bool)
+        self.sign, self.offset = (
+            config.per_joint(name, hand.num_joints).astype(np.float32) for name in ("joint_sign", "joint_offset")
+        )
+        self._gains = {name: config.per_joint(name, hand.num_joints) for name in ("kp", "ki", "kd")}
+        self.tare = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
+        self._tared, self._advised = self.tare, np.zeros(hand.num_fingers, bool)
         self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
         if calibration is None:
-            self._per_count = np.full((frames.TIPS, 1), config.force_per_count, np.float32)
+            self._per_count = np.full((hand.num_fingers, 1), config.force_per_count, np.float32)
             scale = np.float32(config.current_sign / config.current_scale)
             self._torque = lambda counts: counts * scale
         else:
@@ -119,24 +115,39 @@ class HandSensing:
                 lambda counts: normalised_torque(calibration, current_from_counts(calibration, counts))
             )
 
+    @property
+    def block(self) -> np.dtype:
+        """The state block of this hand with a driver of its own."""
+        return frames.driver_block(self.hand.num_joints, self.hand.num_fingers, self.hand.num_taxels)
+
+    def decode(self, data: bytes) -> np.ndarray:
+        """A logged state: of the XHand's wire, or of a driver. HandError: it is of another hand."""
+        for block in (self.block, frames.STATE_BLOCK):
+            if len(data) == block.itemsize:
+                return frames.decode_state(data, block)
+        raise HandError(
+            f"a logged state of {len(data)} bytes is of another hand than {self.hand.name}: give its --hand"
+        )
+
     def measure(self, state: np.ndarray) -> HandMeasurement:
-        """A `frames.STATE_BLOCK` in SI units."""
+        """A `frames.STATE_BLOCK` or `frames.driver_block` in SI units."""
         joint, tip = state["joint"], state["tip"]
         counts = np.maximum(self.counts(state) - self.tare, 0.0)
         counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
         board, palm = joint["temperature"] & 0xFF, joint["temperature"] >> 8
+        current = joint["current"].astype(np.float32)
         return HandMeasurement(
-            joint_position=joint["position"] * self._sign + self._offset,
-            joint_torque=np.asarray(self._torque(joint["current"].astype(np.float32)), np.float32),
+            joint_position=joint["position"] * self.sign + self.offset,
+            joint_torque=np.nan_to_num(np.asarray(self._torque(current), np.float32)),
             taxel_force=counts * self._per_count,
-            current=np.abs(joint["current"].astype(np.float32)) * np.float32(1e-3),
+            current=np.abs(current) * np.float32(1e-3),
             temperature=np.concatenate([board, tip["temperature"], [palm.max()]]).astype(np.float32),
             errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
             mode=(joint["raw_position"] & 0xF).astype(np.uint8),
         )
 
     def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:
-        """Tare the taxels: their mean counts over these `frames.STATE_BLOCK`s of an untouched hand read as no force.
+        """Tare the taxels: their mean counts over these states of an untouched hand read as no force.
 
         Stuck taxels are masked; returns a line for each fingertip with some. Raises HandError: a fingertip touches
         something, or has many stuck taxels.
@@ -181,18 +192,18 @@ class HandSensing:
         ]
 
     def command(self, position: np.ndarray, mode: Mode, stiffness: float = 1.0) -> np.ndarray:
-        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.
+        """Joint commands (`frames.command_block`) for joint angles [J] rad of the model.
 
-        `stiffness` is a share of the gains kp and ki in [0, 1]; those of damping are always whole. Raises HandError: an
-        angle is not finite.
+        Gains are 0 in all modes but `POSITION`. `stiffness` is a share of the gains kp and ki in [0, 1]; those of
+        damping are always whole. Raises HandError: an angle is not finite.
         """
-        config, on = self.config, mode == Mode.POSITION
+        on, gains = mode == Mode.POSITION, self._gains
         block = frames.command_block(
-            (np.asarray(position) - self._offset) * self._sign,
-            kp=np.array(config.kp) * stiffness * on,
-            ki=np.array(config.ki) * stiffness * on,
-            kd=np.array(config.kd) * on,
-            torque_max=config.torque_max * on,
+            (np.asarray(position) - self.offset) * self.sign,
+            kp=gains["kp"] * stiffness * on,
+            ki=gains["ki"] * stiffness * on,
+            kd=gains["kd"] * on,
+            torque_max=self.config.torque_max * on,
             mode=mode,
         )
         if not np.isfinite(block["position"]).all():
@@ -208,15 +219,16 @@ class HandSensing:
 
 
 class VelocityFilter:
-    """Joint velocities: differences of the joint angles through a first-order filter."""
+    """Joint velocities [J] rad/s: differences of the joint angles through a first-order filter."""
 
-    def __init__(self) -> None:
+    def __init__(self, joints: int):
+        self._joints = joints
         self.reset()
 
     def reset(self) -> None:
         """Forget all measurements."""
         self._last: tuple[float, np.ndarray] | None = None
-        self.velocity = np.zeros(_JOINTS, np.float32)
+        self.velocity = np.zeros(self._joints, np.float32)
 
     def estimate(self, time: float, position: np.ndarray) -> np.ndarray:
         """Velocities [J] rad/s if this measurement [J] rad at a time in s were kept."""

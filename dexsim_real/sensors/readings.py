@@ -13,6 +13,14 @@ from dexsim_real.sensors.hand import HandMeasurement
 SOURCES = ("hand", "camera", "imu", "user", "policy")
 """Who gives the bridge what a policy observes; see `ObservationField.source`."""
 
+NEEDS = {
+    "joint_torque": ("currents",),
+    "contact_force": ("taxels",),
+    "contact_centre": ("taxels",),
+    "finger_force": ("taxels", "currents"),
+}
+"""What a hand must measure, besides its angles, for an observation field."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEstimate:
@@ -32,6 +40,28 @@ def sources_of(names: Sequence[str]) -> set[str]:
                 f"the policy observes {name!r:.80}, which no sensor measures on hardware; use a policy without it"
             )
     return {FIELDS[name].source for name in names}
+
+
+def check_measured(names: Sequence[str], force_loop: bool, missing: Sequence[str]) -> None:
+    """Check that a hand measures what a policy needs.
+
+    Args:
+      names: of the observation fields.
+      force_loop: whether the policy's command follows the estimated force.
+      missing: what the hand does not measure; names in `NEEDS`.
+
+    Raises:
+      HandError: it does not measure an observation field, or the force of the loop.
+    """
+    wanted = {f"observes {name!r}": NEEDS.get(name, ()) for name in names}
+    if force_loop:
+        wanted["corrects its command by the measured force"] = NEEDS["finger_force"]
+    for what, needs in wanted.items():
+        if lacking := [need for need in needs if need in missing]:
+            raise HandError(
+                f"the policy {what}, and the hand has no {' and no '.join(lacking)}; train one without it "
+                "(--env.observation.leave-out, --env.control.force.gain 0)"
+            )
 
 
 def make_readings(

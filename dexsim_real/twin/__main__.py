@@ -18,12 +18,12 @@ from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.process import use_realtime
-from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.twin.wire.firmware import SERIALS
+from dexsim_real.wire.serial_hand import check_wire
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:

@@ -91,6 +91,20 @@ TIP_STATE = np.dtype(
 STATE_BLOCK = np.dtype([("joint", JOINT_STATE, JOINTS), ("tip", TIP_STATE, TIPS)])
 """Data of an `EXCHANGE` from the hand, 2208 bytes."""
 
+
+def driver_block(joints: int, fingers: int, taxels: int) -> np.dtype:
+    """The state of a hand with a driver of its own: fields of `STATE_BLOCK`, not rounded to the wire's integers.
+
+    Units are those of the wire, in which sensing has its limits: mA, and taxel counts of 0.1 N. Currents are NaN where
+    the hand has none.
+    """
+    words = ("raw_position", "temperature", "palm_error", "joint_error", "tip_error")
+    joint = np.dtype([("id", "<u2"), ("position", "<f4"), ("current", "<f4"), *((word, "<u2") for word in words)])
+    force = np.dtype([(axis, "<f4") for axis in "xyz"])
+    tip = np.dtype([("taxel", force, (taxels,)), ("temperature", "u1")])
+    return np.dtype([("joint", joint, (joints,)), ("tip", tip, (fingers,))])
+
+
 HAND_REPLIES: dict[int, range] = {
     Command.EXCHANGE: range(STATE_BLOCK.itemsize, STATE_BLOCK.itemsize + 1),
     Command.ERROR: range(1, 65),
@@ -244,9 +258,10 @@ def command_block(
     torque_max: np.ndarray | int,
     mode: np.ndarray | int = Mode.POSITION,
 ) -> np.ndarray:
-    """A `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current limit in mA; a scalar is for all."""
-    block = np.zeros((), COMMAND_BLOCK)
-    block["id"] = np.arange(JOINTS)
+    """Joint commands [J], a `COMMAND_BLOCK` on the wire: angles [J] rad, gains in the firmware's units, current limit
+    in mA; a scalar is for all."""
+    block = np.zeros(len(position), JOINT_COMMAND)
+    block["id"] = np.arange(len(position))
     block["position"] = position
     block["kp"], block["ki"], block["kd"] = kp, ki, kd
     block["torque_max"], block["mode"] = torque_max, mode
@@ -261,16 +276,21 @@ def empty_state() -> np.ndarray:
     return block
 
 
-def decode_command(data: bytes) -> np.ndarray:
-    """Joint commands [12] from the data of a host's `EXCHANGE`. FrameError: wrong size, or the ids are not 0 to 11."""
-    block = _decode(data, COMMAND_BLOCK)
+def passive_command(joints: int = JOINTS) -> np.ndarray:
+    """Joint commands [J] with all motors off."""
+    return command_block(np.zeros(joints), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
+
+
+def decode_command(data: bytes, joints: int = JOINTS) -> np.ndarray:
+    """Joint commands [J] from the data of a host's `EXCHANGE`. FrameError: wrong size, or ids that do not count up."""
+    block = _decode(data, np.dtype((JOINT_COMMAND, (joints,))))
     _check_ids(block["id"])
     return block
 
 
-def decode_state(data: bytes) -> np.ndarray:
-    """The state from the data of a hand's `EXCHANGE`. FrameError: wrong size, or the joint ids are not 0 to 11."""
-    block = _decode(data, STATE_BLOCK)
+def decode_state(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
+    """The state from the data of a hand's `EXCHANGE`. FrameError: wrong size, or joint ids that do not count up."""
+    block = _decode(data, dtype)
     _check_ids(block["joint"]["id"])
     return block
 
@@ -282,5 +302,5 @@ def _decode(data: bytes, dtype: np.dtype) -> np.ndarray:
 
 
 def _check_ids(ids: np.ndarray) -> None:
-    if not np.array_equal(ids, np.arange(JOINTS)):
+    if not np.array_equal(ids, np.arange(len(ids))):
         raise FrameError(f"block with joint ids {ids.tolist()}")

@@ -1,21 +1,17 @@
-"""The link to a hand: configuration, statistics, and the interface that a hand must provide.
+"""The link to a hand: configuration, statistics, and the port that the exchange loop talks to.
 
-`dexsim_real.wire.serial_hand.SerialHand` implements `HandPort` for serial ports. A vendor's SDK can be wrapped in
-another implementation.
+`HandPort` has two implementations: `dexsim_real.wire.serial_hand.SerialHand` for the XHand's serial line, and
+`dexsim_real.wire.driver.DriverPort` around a driver for any other hand.
 """
 
 import dataclasses
-import math
 from typing import Protocol
 
 import numpy as np
 
 from dexsim.core.config import Config, Range, setting
-from dexsim_real.core.errors import HandError
-from dexsim_real.wire import frames
 
 BITS_PER_BYTE = 10  # 8N1
-_AHEAD = 1.0  # s, by which no stamp of the same clock is ahead
 _BASE = 1501000
 _NAMES = {
     1: "wrong id",
@@ -120,40 +116,21 @@ def read_refusal(data: bytes) -> Refusal:
 class Reply:
     """An answered exchange."""
 
-    state: np.ndarray  # `frames.STATE_BLOCK`
+    state: np.ndarray  # `frames.STATE_BLOCK` or `frames.driver_block`
     sent: float  # s, monotonic clock
     received: float  # s
     sequence: int  # number of this exchange since the port was created
     generation: int  # number of handshakes; it grows when the hand was disconnected
 
 
-def checked(reply: Reply, now: float) -> Reply:
-    """A reply that the loop can rely on: a driver from elsewhere may have made it.
-
-    A stamp a little ahead of `now` s becomes `now`: it must grow old. Raises HandError: no reply, its state is none or
-    of another hand, or it was stamped by another clock.
-    """
-    if not isinstance(reply, Reply):
-        raise HandError(f"the driver answered with {type(reply).__name__}; expected a `Reply`, or None")
-    # A copy: a driver may have one buffer for all its answers. Plain numbers: a log keeps NumPy's as arrays.
-    state = np.array(reply.state)
-    if state.dtype != frames.STATE_BLOCK or state.shape != ():
-        raise HandError(
-            f"the driver's reply has a state of {state.dtype.name} {list(state.shape)}; expected a `frames.STATE_BLOCK`"
-        )
-    if not np.array_equal(state["joint"]["id"], np.arange(frames.JOINTS)):
-        raise HandError(f"the driver's reply has joint ids {state['joint']['id'].tolist()}; expected 0 to 11")
-    sent, received = float(reply.sent), float(reply.received)
-    if not (math.isfinite(sent) and received <= now + _AHEAD):
-        raise HandError(
-            f"the driver stamped its reply {received - now:.3g} s ahead: `Reply` has times of `time.monotonic()`"
-        )
-    return Reply(state, sent, min(received, now), int(reply.sequence), int(reply.generation))
-
-
 def refusal_of(port: "HandPort") -> Refusal | None:
     """Why the newest exchange was refused, if the port tells it."""
     return getattr(port, "refusal", None)
+
+
+def missing_of(port: "HandPort") -> list[str]:
+    """What the hand does not measure, by the names of `dexsim_real.wire.driver.WITHOUT`."""
+    return getattr(port, "missing", [])
 
 
 def greet(port: "HandPort") -> list[str]:
@@ -166,8 +143,9 @@ def greet(port: "HandPort") -> list[str]:
 class HandPort(Protocol):
     """The interface of a hand. `exchange` is called from one thread only.
 
-    A port may also have `warnings()`, lines for the user; `identity`, a `dexsim_real.wire.identity.Identity` or None;
-    and `refusal`, a `Refusal` when the newest exchange was refused, else None.
+    A port may also have `warnings()`, lines for the user; `missing`, what the hand does not measure; `identity`, a
+    `dexsim_real.wire.identity.Identity` or None; and `refusal`, a `Refusal` when the newest exchange was refused, else
+    None.
     """
 
     counts: LinkCounts
@@ -181,11 +159,11 @@ class HandPort(Protocol):
         ...
 
     def exchange(self, command: np.ndarray) -> Reply | None:
-        """Send joint commands (`frames.COMMAND_BLOCK`); None when no valid answer arrived in time.
+        """Send joint commands (`frames.command_block`); None when no valid answer arrived in time.
 
         Line errors never raise. It returns within a second, also while the hand is gone: the guard process takes a
         runner that does not move for dead. After a reconnection the given command is not sent: the first reply of a new
-        generation comes from a passive hand.
+        generation comes from a passive hand. A passive command is answered only once the motors are off.
         """
         ...
 

@@ -1,7 +1,7 @@
 """The hand on a serial port: requests and answers with deadlines, statistics, reconnection.
 
 `SerialHand` sends the frames of `dexsim_real.wire.frames` over pyserial, to a USB adapter or a pseudo-terminal.
-`open_port` also accepts a `HandPort` of the user's own, for example around a vendor's SDK.
+`open_port` opens it, or a `HandDriver` for another hand.
 """
 
 import contextlib
@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.install import install_line
+from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
 from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.driver import DriverPort
+from dexsim_real.wire.frames import Command, Frame, passive_command
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
 from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Refusal, Reply, read_refusal
 
@@ -28,11 +30,6 @@ _QUIET = 0.006  # s without a byte after which a frame has ended
 _ATTEMPTS = 2  # to read a register
 _REGISTER = 34  # bytes of the answer: number and content
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
-
-
-def passive_command() -> np.ndarray:
-    """Joint commands with all motors off."""
-    return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
 
 
 class SerialHand:
@@ -291,14 +288,28 @@ class SerialHand:
         return self._first
 
 
-def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
-    """The hand at a port: a serial port, or `sdk:MODULE:FUNCTION` for a function that takes a `LinkConfig` and returns
-    a `HandPort`. `tap` is that of `SerialHand`. HandError: the module or function cannot be found.
+def check_wire(hand: Hand) -> None:
+    """Raises HandError: the hand has other joints or taxels than the frames carry."""
+    if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (frames.JOINTS, frames.TIPS, frames.TAXELS):
+        raise HandError(
+            f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the XHand's "
+            f"frames carry {frames.JOINTS} and {frames.TIPS} x {frames.TAXELS}: give a driver, --port sdk:MODULE "
+            "(docs/bridge.md)"
+        )
+
+
+def open_port(spec: str, hand: Hand, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
+    """The hand at a port: an XHand's serial port, or `sdk:MODULE:FUNCTION` for a function that takes the `Hand` and a
+    `LinkConfig` and returns a `HandDriver`. `tap` is that of `SerialHand`.
+
+    Raises HandError: the module or function cannot be found, or the serial port is for another hand.
     """
     if not spec.startswith("sdk:"):
+        check_wire(hand)
         return SerialHand(spec, config, tap=tap)
     form = "sdk:MODULE:FUNCTION of an importable module"
-    return find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
+    driver = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(hand, config)
+    return DriverPort(driver, hand, config, tap=tap)
 
 
 def _printable(data: bytes) -> str:

@@ -119,7 +119,8 @@ class PressBench(EmulatedHand):
         point = probe.site_xpos[site] + frame @ self.hand.taxel_position[finger, taxels].mean(0)
         normal = frame @ self.hand.taxel_normal[finger, taxels].mean(0)
         self._facing = normal / np.linalg.norm(normal)
-        along = frame @ (self.hand.taxel_position[finger, 11] - self.hand.taxel_position[finger, 0])
+        last = self.hand.taxel_grid[1] - 1
+        along = frame @ (self.hand.taxel_position[finger, last] - self.hand.taxel_position[finger, 0])
         quat = _facing(self._facing, along)
         far = 0.03
         put(self._scene, probe, point + (_RADIUS + far) * self._facing, quat)

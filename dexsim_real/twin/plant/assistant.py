@@ -14,6 +14,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import Scene
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, turn
@@ -28,6 +30,26 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
 are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
+
+
+class Start(NamedTuple):
+    """Where the trials of a hand begin; palm frame."""
+
+    posture: np.ndarray  # [J] rad
+    reference: np.ndarray  # [3] m, nominal position of the object
+    place: np.ndarray  # [2] m, y and z where it is placed
+
+
+def start_of(hand: Hand, task: str) -> Start:
+    """The start on the XHand, or of a grasp by the TOML of another hand. HandError: its TOML has no grasp."""
+    if hand.num_joints == len(POSTURES[task]):
+        side = np.array([1.0, hand.thumb_side, 1.0])
+        return Start(np.array(POSTURES[task]), REFERENCES[task] * side, PLACES[task] * side[1:])
+    if task != "grasp" or not (hand.grasp_posture and hand.grasp_centre):
+        raise HandError(f"{hand.name}: the emulated hand needs a [grasp] with posture and centre in its TOML")
+    return Start(np.array(hand.grasp_posture), np.array(hand.grasp_centre), np.array(hand.grasp_centre[1:]))
+
+
 MOUNT = (-0.2, -0.2)  # rad, pitch and roll of the hand that is palm up: wrist and thumb side lowered (raised)
 GRAVITY = 9.81  # m/s^2
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
@@ -60,11 +82,6 @@ def tilted_gravity(task: str, tilt: np.ndarray, thumb_side: float = 1.0) -> np.n
     return down
 
 
-def place_along_palm(task: str, thumb_side: float) -> np.ndarray:
-    """Where [2] m along the palm (y, z) the object is placed."""
-    return np.array(PLACES[task]) * (thumb_side, 1.0)
-
-
 class Place(NamedTuple):
     """Release pose and velocity of an object, palm frame."""
 
@@ -79,7 +96,7 @@ class Place(NamedTuple):
 
 
 def sample_place(
-    parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, thumb_side: float
+    parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, start: Start
 ) -> Place:
     """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
     if parameters.task == "rotate":
@@ -95,7 +112,7 @@ def sample_place(
         shift = 0.01 * rng.uniform(-1, 1, 2)
         gap, speed = parameters.gap, parameters.release_speed
     up = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([face + gap + shape.reach(up), *(place_along_palm(parameters.task, thumb_side) + shift)])
+    position = np.array([face + gap + shape.reach(up), *(start.place + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
@@ -105,13 +122,13 @@ def find_place(
     shape: ObjectShape,
     rng: np.random.Generator,
     face: float,
-    thumb_side: float,
+    start: Start,
 ) -> Place | None:
     """Sample a release pose that the hand in its start posture leaves clear; None if there seems to be none."""
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
+    scene.set_joints(data, start.posture)
     for _ in range(_PLACES):
-        place = sample_place(parameters, shape, rng, face, thumb_side)
+        place = sample_place(parameters, shape, rng, face, start)
         if clear(scene, data, place):
             return place
     return None
@@ -145,15 +162,15 @@ class Assistant:
     """Decides the stage of a trial.
 
     Args:
-      task: "grasp" or "rotate".
+      posture: [J] rad, where trials start.
       patience: s after which a runner that does not return to the start posture gets its object where it is.
 
     Attributes:
       reaction: s from the first motion of the targets to the release, a person's.
     """
 
-    def __init__(self, task: str, patience: float = 15.0):
-        self._posture, self._patience, self.reaction = np.array(POSTURES[task]), patience, 0.0
+    def __init__(self, posture: np.ndarray, patience: float = 15.0):
+        self._posture, self._patience, self.reaction = np.asarray(posture), patience, 0.0
         self.begin()
 
     def begin(self) -> None:

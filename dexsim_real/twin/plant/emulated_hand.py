@@ -15,16 +15,7 @@ import numpy as np
 
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.assistant import (
-    GRAVITY,
-    Assistant,
-    Stage,
-    clear,
-    find_place,
-    place_along_palm,
-    put,
-    tilted_gravity,
-)
+from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, clear, find_place, put, start_of, tilted_gravity
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.hand_model import own_model, read_model
 from dexsim_real.twin.plant.parameters import (
@@ -115,7 +106,8 @@ class EmulatedHand:
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
         self.seed, self.kind, self._end = seed, kind, None if trials is None else first + trials
         self._overrides, self._seconds, self._shape = overrides, seconds, shape
-        self._assistant = Assistant(task)
+        self._start = start_of(hand, task)
+        self._assistant = Assistant(self._start.posture)
         self._done: list[dict[str, Any]] = []
         self.trial = first - 1
         self._next_trial()
@@ -215,12 +207,12 @@ class EmulatedHand:
             return
         rng = np.random.default_rng([self.seed, self.trial])
         for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
-            parameters = sample_trial(self.task, rng, self.kind, self._overrides)
+            parameters = sample_trial(self.task, rng, self.kind, self._overrides, self.hand)
             shape = sample_shape(parameters, rng, self._shape)
             scene = self._draw(parameters, shape)
-            where, side = place_along_palm(self.task, self.hand.thumb_side), self.hand.thumb_side
-            self._palm_face = palm_face(scene, where) if self._model.foreign else PALM_FACE
-            place = find_place(scene, parameters, shape, rng, self._palm_face, side)
+            own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
+            self._palm_face = palm_face(scene, tuple(self._start.place)) if self._model.foreign else own
+            place = find_place(scene, parameters, shape, rng, self._palm_face, self._start)
             if place is not None:
                 break
         else:
@@ -228,7 +220,8 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
-        self._referee = Referee(self.task, self._seconds, self.hand.thumb_side)
+        reference, fingers = self._start.reference, self.hand.num_fingers
+        self._referee = Referee(self.task, self._seconds, reference, fingers, self.hand.thumb_side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -248,7 +241,7 @@ class EmulatedHand:
         self._noise, self._object_noise = rng.spawn(2)
         self._drives.configure(self.parameters)
         self._skin.configure(self.parameters, rng)
-        self._data.qpos[scene.drive_qpos] = self._joints
+        scene.set_joints(self._data, self._joints)
         self._began = self.time
         self._touches: list[TipContact] = []
         self._no_force = np.zeros((*self.hand.taxel_position.shape[:2], 3))

@@ -58,11 +58,8 @@ class _Names:
 def own_model(hand: Hand) -> HandModel:
     """The hand's own MJCF; its collisions, options and motors are left out.
 
-    Raises:
-      HandError: the hand has coupled joints.
+    Coupled joints follow the motor's side of the gear, without its play.
     """
-    if hand.num_hinges > hand.num_joints:
-        raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     _delete(spec, *spec.actuators, *spec.sensors, *spec.keys)
     spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.

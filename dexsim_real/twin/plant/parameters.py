@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
 KINDS = ("outside", "inside", "nominal")
@@ -38,9 +39,9 @@ class Band:
     per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
     sides: str = "both"  # possible ends: "both", "high", "low"; "within": the hand's own range, not training's
 
-    def sample(self, rng: np.random.Generator, kind: str) -> np.ndarray:
-        """Sample values of a kind in `KINDS`; the shape follows from `per`."""
-        shape, width = _COUNT[self.per], self.high - self.low
+    def sample(self, rng: np.random.Generator, kind: str, count: Mapping[str, tuple[int, ...]] = _COUNT) -> np.ndarray:
+        """Sample values of a kind in `KINDS`; the shape follows from `per`, by the `count` of joints and fingers."""
+        shape, width = count[self.per], self.high - self.low
         # Every kind consumes the same random numbers, so that kinds differ in nothing else.
         side, place = rng.random(shape), rng.random(shape)
         if kind == "nominal":
@@ -172,11 +173,16 @@ def bands(task: str) -> dict[str, Band]:
 
 
 def sample_trial(
-    task: str, rng: np.random.Generator, kind: str = "outside", overrides: Mapping[str, float | str] | None = None
+    task: str,
+    rng: np.random.Generator,
+    kind: str = "outside",
+    overrides: Mapping[str, float | str] | None = None,
+    hand: Hand | None = None,
 ) -> TrialParameters:
     """Sample the parameters of a trial.
 
     Args:
+      hand: gives the number of joints and fingers; None is the XHand.
       overrides: by name a value, the same for all joints, fingers or axes; or one of `KINDS` for this parameter alone.
 
     Raises:
@@ -193,7 +199,8 @@ def sample_trial(
             )
         if name in kinds and number not in KINDS:
             raise HandError(f"{name} = {number!r}: give a number, or one of {', '.join(KINDS)}")
-    value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
+    count = _COUNT | ({"joint": (hand.num_joints,), "finger": (hand.num_fingers,)} if hand else {})
+    value = {name: table[name].sample(rng, kinds.get(name, kind), count) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
     return TrialParameters(task, value)

@@ -55,17 +55,27 @@ class Referee:
     Args:
       task: "grasp" or "rotate".
       seconds: time limit; None is that of the task.
+      reference: [3] m, nominal position of the object; None is that on the XHand.
+      fingers: their number.
       thumb_side: the hand's; the goals of a left hand are those of its mirror image.
     """
 
-    def __init__(self, task: str, seconds: float | None = None, thumb_side: float = 1.0):
+    def __init__(
+        self,
+        task: str,
+        seconds: float | None = None,
+        reference: np.ndarray | None = None,
+        fingers: int = 5,
+        thumb_side: float = 1.0,
+    ):
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
-        self._reference, self._step = np.array(REFERENCES[task]) * (1.0, thumb_side, 1.0), thumb_side * GOAL_STEP
+        self._reference = np.array(REFERENCES[task] if reference is None else reference)
+        self._step = thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
-        self._force, self._duty, self._speed = np.zeros(5), np.zeros(5), 0.0
+        self._force, self._duty, self._speed = np.zeros(fingers), np.zeros(fingers), 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
         self._heading: float | None = None  # rad, at the release

@@ -50,6 +50,14 @@ class Scene:
         self.finger_of_geom = np.array([finger.get(int(bodies[body]), -1) for body in model.geom_bodyid])
         self.is_object = model.geom_bodyid == self.object_body
 
+    def set_joints(self, data: mujoco.MjData, joints: np.ndarray) -> None:
+        """Set the angles [J] rad of the drives, and of the hinges that follow them by an equality."""
+        model, data.qpos[self.drive_qpos] = self.model, joints
+        for index in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj2id >= 0)):
+            follower, drive = model.jnt_qposadr[[model.eq_obj1id[index], model.eq_obj2id[index]]]
+            offset, ratio = model.eq_data[index, :2]
+            data.qpos[follower] = model.qpos0[follower] + offset + ratio * (data.qpos[drive] - model.qpos0[drive])
+
 
 def _addresses(joints: list[Any]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([joint.qposadr[0] for joint in joints]), np.array([joint.dofadr[0] for joint in joints])

@@ -12,9 +12,8 @@ import numpy as np
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, PlantMeasurement
 from dexsim_real.twin.wire.faults import ALL, Fault
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.frames import Command, Frame, Mode, passive_command
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
-from dexsim_real.wire.serial_hand import passive_command
 
 OVERHEATED = 1
 """Error bit of a joint, defined by this board: too hot and off."""

@@ -30,8 +30,9 @@ from dexsim_real.loop import TARE_SAMPLES
 from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.wire.frames import Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig, LinkCounts, Reply
+from dexsim_real.wire.driver import WITHOUT, DriverState
+from dexsim_real.wire.frames import Command, Frame
+from dexsim_real.wire.link import LinkConfig
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
@@ -263,19 +264,24 @@ def test_a_wrong_option_moves_nothing(tmp_path):
 class Driver:
     """Answers until its trouble begins."""
 
+    measures = frozenset(WITHOUT)
+
     def __init__(self, trouble, after):
-        self.counts, self.trouble, self.after = LinkCounts(), trouble, after
+        self.trouble, self.after, self.reads = trouble, after, 0
 
     def connect(self):
         return "a hand of mine"
 
-    def exchange(self, command):
+    def send(self, targets):
+        assert not targets.on
+
+    def read(self):
         time.sleep(0.002)
-        self.counts.sent += 1
-        if self.counts.sent > self.after:
-            return self.trouble()
-        now = time.monotonic()
-        return Reply(empty_state(), now, now, self.counts.sent, 1)
+        self.reads += 1
+        zero = np.zeros(12)
+        return (
+            self.trouble() if self.reads > self.after else DriverState(zero, zero > 0, zero, zero, np.zeros((5, 120)))
+        )
 
     def close(self):
         pass
@@ -286,7 +292,7 @@ def start(tmp_path, monkeypatch):
     """Runs the command over a driver."""
 
     def start(driver):
-        monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda config: driver))
+        monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
         return run.main(arguments(SimpleNamespace(port="sdk:my_sdk"), tmp_path))
 
     return start
@@ -297,10 +303,12 @@ def broken():
 
 
 def misshapen():
-    return Reply(np.zeros(12), 0.0, 0.0, 1, 1)
+    return DriverState(np.zeros(11), np.zeros(12, bool), *np.zeros((2, 12)), np.zeros((5, 120)))
 
 
-@pytest.mark.parametrize(("trouble", "says"), [(broken, "the SDK broke"), (misshapen, r"state of float64 \[12\]")])
+@pytest.mark.parametrize(
+    ("trouble", "says"), [(broken, "the SDK broke"), (misshapen, r"position has the shape \[11\]")]
+)
 def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(start, trouble, says):
     """Not that the hand has stopped answering."""
     with pytest.raises(HandError, match=f"the exchange thread failed: .*{says}"):

@@ -11,6 +11,7 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand
 from pty_hand import QUICK
 
+from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.motors_off import PATIENCE
 from dexsim_real.control.safety import Safety
@@ -52,7 +53,7 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
     patience = guard._ANSWER
     assert patience + guard._MOMENT < 1.0
     monkeypatch.setattr(guard, "_ANSWER", 20.0)  # A busy machine is not a suspended guard.
-    watched = Guard(peer.port, QUICK)
+    watched = Guard(peer.port, QUICK, load_hand())
     watched.arm()
     try:
         for _ in range(20):
@@ -102,13 +103,20 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(p
     """What it prints is no word of the guard's, and has no reader once the runner is gone."""
     (tmp_path / "loud_sdk.py").write_text(
         "import sys\n"
+        "from dexsim_real.wire.driver import DriverState\n"
+        "from dexsim_real.wire.frames import Mode, passive_command\n"
         "from dexsim_real.wire.serial_hand import SerialHand\n"
         "print('SDK 1.0', flush=True)\n"
         "opened = []\n"
         "class Loud:\n"
+        "    measures = frozenset()\n"
         "    def __init__(self, *given):\n"
         "        self.hand = SerialHand(*given)\n"
-        "        self.counts, self.exchange = self.hand.counts, self.hand.exchange\n"
+        "    def send(self, targets):\n"
+        "        assert not targets.on\n"
+        "    def read(self):\n"
+        "        reply = self.hand.exchange(passive_command())\n"
+        "        return reply and DriverState(reply.state['joint']['position'], reply.state['joint']['id'] < 0)\n"
         "    def connect(self):\n"
         "        print('connecting', flush=True)\n"
         "        if len(opened) < 2:\n"
@@ -117,12 +125,12 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(p
         "    def close(self):\n"
         "        self.hand.close()\n"
         "        raise RuntimeError('close failed')\n"
-        "def open_hand(config):\n"
+        "def open_hand(hand, config):\n"
         "    opened.append(config)\n"
         f"    return Loud({peer.port!r}, config)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    armed = Guard("sdk:loud_sdk", QUICK)
+    armed = Guard("sdk:loud_sdk", QUICK, load_hand())
     armed.arm()
     armed.dismiss(off=False)
     assert armed._process.wait(10) == 0

@@ -15,12 +15,12 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, summary
 from pty_hand import QUICK
 
+from dexsim import load_hand
 from dexsim_real.control.motors_off import turn_off
 from dexsim_real.core.process import ignore_signals, stopping
 from dexsim_real.run.guard import Guard
-from dexsim_real.wire.frames import empty_state
+from dexsim_real.wire.frames import empty_state, passive_command
 from dexsim_real.wire.link import Reply
-from dexsim_real.wire.serial_hand import passive_command
 
 
 def runner(peer, folder, *more):
@@ -147,7 +147,7 @@ def test_the_guard_stops_the_hand_of_a_runner_that_was_killed_or_suspended(tmp_p
 def test_the_guard_waits_for_a_cable():
     with FollowingHand() as peer:
         peer.close()
-        guard = Guard(peer.port, QUICK)
+        guard = Guard(peer.port, QUICK, load_hand())
         guard.arm()
         guard.check()
         guard.dismiss(off=False)

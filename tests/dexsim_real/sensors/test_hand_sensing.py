@@ -104,7 +104,7 @@ def test_temperatures_and_error_bits_are_of_the_right_boards(hand):
 
 def test_velocity_from_differences():
     # A first-order filter: after n steps of h at a constant rate, 1 - (T / (T + h))^n of it is seen.
-    follow = VelocityFilter()
+    follow = VelocityFilter(12)
     for n in range(6):
         velocity = follow.update(0.01 * n, np.full(12, 0.03 * n, np.float32))
     np.testing.assert_allclose(velocity, 3.0 * (1 - (2 / 3) ** 5), rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Opening a port: messages for the usual problems, latency timer, deadlines; and what a driver of the user's gives."""
+"""Opening a port: messages for the usual problems, latency timer, deadlines, and what a port may tell."""
 
 import dataclasses
 import errno
@@ -7,14 +7,14 @@ import re
 import termios
 
 import memory_line
-import numpy as np
 import pytest
 from pty_hand import QUICK, PtyHand
 
+from dexsim import load_hand
 from dexsim_real.core.errors import HandError, explain
 from dexsim_real.sensors.imu import Imu
-from dexsim_real.wire.frames import STATE_BLOCK, Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig, Refusal, Reply, checked, greet, refusal_of
+from dexsim_real.wire.frames import Command, Frame, empty_state
+from dexsim_real.wire.link import LinkConfig, Refusal, greet, refusal_of
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 serial = pytest.importorskip("serial")
@@ -56,7 +56,7 @@ def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():
         port.close()
 
 
-def test_messages_for_the_usual_troubles(tmp_path):
+def test_messages_for_the_usual_troubles(hand, tmp_path):
     with pytest.raises(HandError, match="there is no such port"):
         SerialHand(str(tmp_path / "none"), QUICK).connect()
     file = tmp_path / "port"
@@ -67,7 +67,9 @@ def test_messages_for_the_usual_troubles(tmp_path):
     assert "another program" in explain("/dev/x", OSError(errno.EBUSY, "busy"))
     for spec in ("sdk:no_such_module:f", "sdk:", "sdk:math:no_such_function"):
         with pytest.raises(HandError, match=f"^{re.escape(spec)}: .*give sdk:MODULE:FUNCTION"):
-            open_port(spec, QUICK)
+            open_port(spec, hand, QUICK)
+    with pytest.raises(HandError, match="leap_like: 16 joints and 4 x 48 taxels.*--port sdk:MODULE"):
+        open_port("/dev/hand", load_hand("leap_like"), QUICK)
 
 
 @pytest.mark.parametrize("error", [termios.error(errno.EIO, "gone"), NotImplementedError("no write_timeout")])
@@ -85,41 +87,7 @@ def test_a_port_that_does_not_open_is_one_line(monkeypatch, error):
         Imu("/dev/imu")
 
 
-GOOD = Reply(empty_state(), 9.99, 10.0, 1, 1)
-SHUFFLED = empty_state()
-SHUFFLED["joint"]["id"] = np.arange(12)[::-1]
-
-
-@pytest.mark.parametrize(
-    ("reply", "says"),
-    [
-        ([1, 2], "answered with list"),
-        (dataclasses.replace(GOOD, received=1.7e9), "1.7e.09 s ahead.*time.monotonic"),
-        (dataclasses.replace(GOOD, received=np.nan), "nan s ahead"),
-        (dataclasses.replace(GOOD, sent=np.nan), "time.monotonic"),
-        (dataclasses.replace(GOOD, state=None), "a state of object"),
-        (dataclasses.replace(GOOD, state=np.zeros(12)), r"float64 \[12\]"),
-        (dataclasses.replace(GOOD, state=np.zeros(2, STATE_BLOCK)), r"\[2\]; expected a"),
-        (dataclasses.replace(GOOD, state=SHUFFLED), r"joint ids \[11, 10"),
-    ],
-)
-def test_a_reply_of_a_driver_is_checked(reply, says):
-    """A stamp of another clock would never grow old: `Safety` would not notice that the hand is silent."""
-    with pytest.raises(HandError, match=says):
-        checked(reply, 10.0)
-
-
-def test_a_reply_becomes_plain_and_does_not_change_afterwards():
-    """A log would keep NumPy's numbers as arrays; a driver may reuse its buffer."""
-    state = empty_state()
-    reply = checked(Reply(state, np.float64(1.0), np.float32(2.6), np.int64(3), np.uint8(1)), 2.5)
-    state["joint"]["position"][:] = 1.0
-    assert not reply.state["joint"]["position"].any()
-    values = [reply.sent, reply.received, reply.sequence, reply.generation]
-    assert values == [1.0, 2.5, 3, 1] and [type(value) for value in values] == [float, float, int, int]
-
-
-def test_what_a_driver_may_tell():
+def test_what_a_port_may_tell():
     class Driver:
         def connect(self):
             return "a hand"

@@ -182,7 +182,7 @@ def test_the_object_is_held_until_the_targets_move_on(hand):
 
 
 def test_motors_that_go_off_take_the_object_back():
-    helper, posture = Assistant("rotate"), np.array(POSTURES["rotate"])
+    helper, posture = Assistant(POSTURES["rotate"]), np.array(POSTURES["rotate"])
     for time, targets, stage in (
         (0.0, posture, Stage.HOLD),
         (0.1, None, Stage.AWAY),
@@ -193,7 +193,7 @@ def test_motors_that_go_off_take_the_object_back():
 
 
 def test_a_runner_that_goes_on_gets_its_object_after_a_while():
-    helper, posture = Assistant("rotate", patience=5.0), np.array(POSTURES["rotate"]) + 0.2
+    helper, posture = Assistant(POSTURES["rotate"], patience=5.0), np.array(POSTURES["rotate"]) + 0.2
     for time, is_clear, stage in (
         (0.0, True, Stage.AWAY),
         (4.9, True, Stage.AWAY),

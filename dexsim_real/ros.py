@@ -1,0 +1,231 @@
+"""A ROS 2 node of the hand: one more user of the exchange loop, with the same safety as a policy's run.
+
+    python -m dexsim_real.ros --ros-args -p port:=/dev/ttyUSB0 -p calibration:=hand.toml
+
+| topic or service | type | content |
+|---|---|---|
+| `joint_states` | sensor_msgs/JointState | rad, rad/s, Nm (no effort without currents) |
+| `~/wrenches/FINGER` | geometry_msgs/WrenchStamped | N, Nm on the fingertip by its taxels, in the frame of its body |
+| `~/taxels` | std_msgs/Float32MultiArray | N, fingers x taxels, in the order of the hand's TOML |
+| `~/commands` | std_msgs/Float64MultiArray | joint targets [J] rad, as for `forward_command_controller` |
+| `~/motors` | std_srvs/SetBool | motors on at the measured pose; off for good |
+
+Commands are a stream: without one for `--safety.watchdog` the hand holds, then its motors go off. With the parameter
+`policy` the policy gives the targets once the motors are on, and `~/commands` does not exist. The parameter `options`
+has further options of `NodeOptions` as on a command line. rclpy is imported when the node runs.
+"""
+
+import dataclasses
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim import load_hand
+from dexsim.calibration.maps import calibrated_hand, load_calibration
+from dexsim.core import cli
+from dexsim.core.config import Config, setting
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.source import recorded_hand
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import Controller, prepare_jax
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.policy_loop import PolicyLoop, limits_for
+from dexsim_real.control.safety import Safety
+from dexsim_real.core.errors import HandError
+from dexsim_real.loop import LoopThread
+from dexsim_real.run.guard import Guard
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.wire.identity import check_identity
+from dexsim_real.wire.link import LinkConfig, greet, missing_of
+from dexsim_real.wire.serial_hand import open_port
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NodeOptions(Config):
+    """Options in the parameter `options`."""
+
+    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
+    """Exchanges with the hand, and messages, per second."""
+    command: float = setting(0.5, unit="1", low=0.0, high=1.0)
+    """Grip command of the policy."""
+    approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
+    """Time to the policy's start posture."""
+    guard: bool = True
+    """Start a second process that turns the motors off when this one dies or freezes."""
+    link: LinkConfig = setting(LinkConfig())
+    """The line."""
+    hardware: HardwareConfig = setting(HardwareConfig())
+    """Signs, scales and gains of the hand."""
+    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.2))
+    """Safety limits."""
+
+
+class HandNode:
+    """The hand behind a `rclpy` node. `start` connects it with the motors off.
+
+    Raises DexsimError: hand, calibration, policy or port do not fit together.
+    """
+
+    def __init__(self, node: Any):
+        from geometry_msgs.msg import WrenchStamped
+        from sensor_msgs.msg import JointState
+        from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
+        from std_srvs.srv import SetBool
+
+        self.node, self._joint_state, self._wrench = node, JointState, WrenchStamped
+        given = {name: node.declare_parameter(name, "").value for name in ("port", "hand", "calibration", "policy")}
+        words = shlex.split(node.declare_parameter("options", "").value)
+        self.options = options = cli.parse(NodeOptions, words, prog="options", description="Options of the node.")
+        policy = load_policy(given["policy"]) if given["policy"] else None
+        recorded = recorded_hand(policy.hand, given["hand"], given["policy"]) if policy else None
+        self.hand = hand = recorded or load_hand(given["hand"] or None)
+        calibration = load_calibration(Path(given["calibration"]), hand) if given["calibration"] else None
+        self.sensing = HandSensing(hand, options.hardware, calibration)
+        self.port, limits = open_port(given["port"], hand, options.link), options.safety
+        self.policy: PolicyLoop | None = None
+        controller = None
+        if policy:
+            controller = Controller(policy, calibrated_hand(hand, calibration))
+            if "imu" in controller.sources:
+                raise HandError(f"{given['policy']} observes the object's orientation: use `python -m dexsim_real.run`")
+            controller.check_measured(missing_of(self.port))
+            controller.warm()
+            limits = limits_for(limits, controller)
+        self.safety = Safety(hand, limits, node.get_logger().info)
+        self.guard = Guard(given["port"], options.link, hand) if options.guard else None
+        beat = self.guard.beat if self.guard else lambda more: None
+        self.loop = LoopThread(self.port, self.sensing, self.safety, options.rate, beat)
+        if controller:
+            self.policy = PolicyLoop(
+                controller,
+                self.safety,
+                ObjectSensors(np.asarray(controller.spec.reference, float), None, None),
+                command=options.command,
+                approach=options.approach,
+                place=0.0,
+            )
+            node.create_timer(controller.period, self.tick)
+        else:
+            node.create_subscription(Float64MultiArray, "~/commands", self.take_command, 1)
+        self._began, self._shown = False, -1  # whether the policy has begun; sequence number of the newest message
+        self._joints = node.create_publisher(JointState, "joint_states", 10)
+        self._wrenches = [node.create_publisher(WrenchStamped, f"~/wrenches/{f}", 10) for f in hand.finger_names]
+        self._taxels = node.create_publisher(Float32MultiArray, "~/taxels", 10)
+        self._array = Float32MultiArray()
+        fingers, taxels = hand.num_fingers, hand.num_taxels
+        for label, size, stride in (("finger", fingers, fingers * taxels), ("taxel", taxels, taxels)):
+            self._array.layout.dim.append(MultiArrayDimension(label=label, size=size, stride=stride))
+        node.create_service(SetBool, "~/motors", self.switch)
+        node.create_timer(1 / options.rate, self.publish)
+
+    def start(self) -> None:
+        """Connect with the motors off, tare the taxels, and start the exchange loop.
+
+        Raises HandError: the hand does not answer, is another one, or something touches a fingertip.
+        """
+        log = self.node.get_logger().info
+        identity = getattr(self.port, "identity", None)
+        for line in greet(self.port):
+            log(line)
+        for line in (*check_identity(identity, self.hand, self.sensing.calibration), *self.loop.tare()):
+            log(line)
+        self.loop.start()
+
+    def close(self) -> None:
+        """Turn the motors off and close the port."""
+        self.loop.stop()
+        if self.guard:
+            self.guard.dismiss(off=not self.loop.driven)
+
+    def switch(self, request: Any, response: Any) -> Any:
+        """The service: motors on, or off for good."""
+        if request.data:
+            if self.guard:
+                self.guard.arm()
+            self.loop.engage()
+        else:
+            self.safety.relax("switched off by ~/motors")
+        response.success = not (request.data and self.safety.latched)
+        response.message = self.safety.latched
+        return response
+
+    def take_command(self, message: Any) -> None:
+        """Joint targets [J] rad; `Safety` limits them."""
+        if len(message.data) != self.hand.num_joints:
+            self.node.get_logger().error(f"{len(message.data)} joint targets, expected {self.hand.num_joints}")
+            return
+        self.safety.set_target(np.asarray(message.data, np.float32), self.loop.clock())
+
+    def tick(self) -> None:
+        """The policy's turn: first to the start posture, then one action."""
+        assert self.policy is not None
+        now = self.loop.clock()
+        if not self.safety.anchor or self.safety.latched:  # The motors are not on yet, or off for good.
+            return
+        if not self._began:
+            self._began = not self.policy.approach(now)
+            if self._began:
+                self.policy.begin()
+        if self._began:
+            self.policy.tick(now)
+
+    def publish(self) -> None:
+        """Publish the newest measurement, once. HandError: the exchange loop has failed."""
+        self.loop.check()
+        if self.guard:
+            self.guard.check()
+        sample = self.safety.sample
+        if sample is None or sample.sequence == self._shown:
+            return
+        self._shown = sample.sequence
+        stamp, measured, hand = self.node.get_clock().now().to_msg(), sample.measured, self.hand
+        joints = self._joint_state(name=list(hand.joint_names))
+        joints.header.stamp = stamp
+        joints.position, joints.velocity = measured.joint_position.tolist(), sample.velocity.tolist()
+        if "currents" not in missing_of(self.port):
+            joints.effort = (measured.joint_torque * hand.torque_limit).tolist()
+        self._joints.publish(joints)
+        if "taxels" in missing_of(self.port):
+            return
+        for publisher, body, parts in zip(
+            self._wrenches, hand.tip_body, tip_wrenches(hand, measured.taxel_force), strict=True
+        ):
+            wrench = self._wrench()
+            wrench.header.stamp, wrench.header.frame_id = stamp, hand.body_names[body]
+            for vector, values in zip((wrench.wrench.force, wrench.wrench.torque), parts, strict=True):
+                vector.x, vector.y, vector.z = values.tolist()
+            publisher.publish(wrench)
+        self._array.data = measured.taxel_force.ravel().tolist()
+        self._taxels.publish(self._array)
+
+
+def tip_wrenches(hand: Hand, taxel_force: np.ndarray) -> np.ndarray:
+    """Force N and torque Nm [F, 2, 3] on each fingertip about the origin of its body: taxels press along their inward
+    normals."""
+    force = -taxel_force[..., None] * hand.taxel_normal
+    return np.stack([force, np.cross(hand.taxel_position, force)], 1).sum(2).astype(float)
+
+
+def main(argv: Any = None) -> int:
+    """The command."""
+    import rclpy
+
+    prepare_jax()
+    rclpy.init()
+    node = rclpy.create_node("dexsim_hand")
+    hand = HandNode(node)
+    try:
+        hand.start()
+        rclpy.spin(node)
+    finally:
+        hand.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,81 @@
+"""A mock of any hand, made from its folder: a driver around the emulated hand, in this process and in real time.
+
+    python -m dexsim_real.run policy.msgpack --port sdk:dexsim_real.twin.mock --uncalibrated --fixed-object --yes
+
+The hand is that of the policy. Its MJCF is the plant of `EmulatedHand`, with motors, taxels and an object that is let
+go over the palm again and again. Currents and temperatures are those of the emulated motors.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.wire.driver import WITHOUT, DriverState, JointTargets
+from dexsim_real.wire.frames import Mode, command_block, passive_command
+from dexsim_real.wire.link import LinkConfig
+
+_SLIP = 0.1  # s that the plant may be behind the clock; what is more is let go, as after a breakpoint
+
+
+class MockHand:
+    """A `HandDriver` whose hand is emulated. The plant advances to the clock at each call.
+
+    Args:
+      plant: the hand and its object.
+      measures: what the hand has, names in `driver.WITHOUT`; all by default.
+      clock: s.
+    """
+
+    def __init__(
+        self, plant: EmulatedHand, measures: Iterable[str] = WITHOUT, clock: Callable[[], float] = time.monotonic
+    ):
+        self.plant, self.measures, self._clock = plant, frozenset(measures), clock
+        self._time = clock()
+        self.motors = passive_command(plant.hand.num_joints)
+
+    def connect(self) -> str:
+        """See `HandDriver.connect`."""
+        self._time = self._clock()
+        self._drive(passive_command(self.plant.hand.num_joints))
+        return f"mock of {self.plant.hand.name}"
+
+    def send(self, targets: JointTargets) -> None:
+        """See `HandDriver.send`."""
+        self._advance()
+        mode = Mode.POSITION if targets.on else Mode.PASSIVE
+        current = np.round(1e3 * targets.current)
+        self._drive(
+            command_block(targets.position, kp=targets.kp, ki=targets.ki, kd=targets.kd, torque_max=current, mode=mode)
+        )
+
+    def read(self) -> DriverState:
+        """See `HandDriver.read`."""
+        self._advance()
+        now, sensors = self.plant.measure(), dict[str, np.ndarray]()
+        if "currents" in self.measures:
+            sensors["current"] = 1e-3 * now.current
+        if "temperatures" in self.measures:
+            sensors["temperature"] = now.temperature
+        if "taxels" in self.measures:
+            sensors["taxel_force"] = np.maximum(now.taxel_force[..., 2], 0.0)
+        return DriverState(now.joint_position, self.motors["mode"] == Mode.POSITION, **sensors)
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def _advance(self) -> None:
+        now = self._clock()
+        self.plant.advance(min(max(now - self._time, 0.0), _SLIP))
+        self._time = now
+
+    def _drive(self, motors: np.ndarray) -> None:
+        self.motors = motors
+        self.plant.drive(motors)
+
+
+def open_hand(hand: Hand, link: LinkConfig) -> MockHand:
+    """For `--port sdk:dexsim_real.twin.mock`."""
+    return MockHand(EmulatedHand(hand, "grasp", kind="nominal"))

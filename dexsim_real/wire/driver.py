@@ -1,0 +1,219 @@
+"""Drivers of hands other than the XHand: the protocol that a driver implements, and the port made of it.
+
+A driver reads and writes SI units and knows nothing of policies or limits. `DriverPort` does the rest: reconnection,
+statistics, and the blocks of `dexsim_real.wire.frames`, so that loop, safety, log and replay are those of every hand.
+`dexsim_real.wire.dynamixel` is an example, `dexsim_real.twin.mock` emulates any hand. docs/bridge.md has the steps.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+from dexsim_real.wire.frames import HOST, Command, Frame, Mode, driver_block, palm_address, passive_command
+from dexsim_real.wire.link import LinkConfig, LinkCounts, Refusal, Reply
+
+NEWTONS_PER_COUNT = 0.1  # of the blocks' taxel counts; the default of `--hardware.force-per-count`
+_PAUSE = 0.002  # s, of a call while the hand is gone
+WITHOUT = {
+    "taxels": "no taxels: policies cannot observe contact_force, contact_centre or finger_force; --safety.finger-force"
+    " and --safety.total-force are off; calibrate has only --identify",
+    "currents": "no currents: policies cannot observe joint_torque and finger_force; --safety.current, "
+    "--safety.stall-current and the check that joints follow their commands are off; calibrate has only --identify, "
+    "and finds no torques",
+    "temperatures": "no temperatures: --safety.temperature is off",
+}
+"""What the bridge cannot do without a measurement, by its name in `HandDriver.measures`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointTargets:
+    """What the motors are to do; angles as the motors count them (`--hardware.joint-sign` and `joint-offset`)."""
+
+    position: np.ndarray  # [J] rad
+    on: bool  # False: motors off, whatever else is said here
+    kp: np.ndarray  # [J] position gain in the motors' own unit (`--hardware.kp`); it grows from 0 at the start
+    ki: np.ndarray  # [J] integral gain (`--hardware.ki`)
+    kd: np.ndarray  # [J] damping gain (`--hardware.kd`)
+    current: np.ndarray  # [J] A, current limit (`--hardware.torque-max`)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriverState:
+    """What a hand measures at one time; None where it has no such sensor."""
+
+    position: np.ndarray  # [J] rad, as the motors count
+    on: np.ndarray  # [J] bool, whether each motor is on, as the hand reports it
+    current: np.ndarray | None = None  # [J] A; `--hardware.current-sign` is its sign when a joint closes
+    temperature: np.ndarray | None = None  # [J] degC, of the motors
+    taxel_force: np.ndarray | None = None  # [F, N] N, pressing into the fingertip
+    errors: np.ndarray | None = None  # [J] error bits, 0 for none: they hold the hand, then turn the motors off
+
+
+class HandDriver(Protocol):
+    """A hand with J joints and F fingers of N taxels, in the order of its TOML. Called from one thread.
+
+    The limits of angles and speeds are those of the hand's MJCF and TOML: `Safety` sends no target beyond them.
+    `connect`, `send` and `read` raise OSError when the line fails; the port then connects again. Each returns within
+    0.3 s, also while the hand is gone: the guard process takes a runner that does not move for dead.
+    """
+
+    measures: frozenset[str]  # of "currents", "temperatures", "taxels": what every `read` gives besides the angles
+
+    def connect(self) -> str:
+        """Open the line and turn the motors off; returns a line that describes the hand.
+
+        Raises:
+          HandError: the hand does not answer, or is another one.
+        """
+        ...
+
+    def send(self, targets: JointTargets) -> None:
+        """Send joint targets, or turn the motors off."""
+        ...
+
+    def read(self) -> DriverState | None:
+        """A state measured after the last `send`; None when no valid answer arrived in time."""
+        ...
+
+    def close(self) -> None:
+        """Close the line; no error where it is closed already."""
+        ...
+
+
+class DriverPort:
+    """`HandPort` of a hand that has a driver.
+
+    Args:
+      hand: gives the number of joints, fingers and taxels.
+      config: how long to wait before connecting again.
+      tap: as for `SerialHand`: called with ("tx" or "rx", bytes of a frame), for the log.
+      clock: s, in which replies are stamped; that of the exchange loop.
+    """
+
+    identity = None
+
+    def __init__(
+        self,
+        driver: HandDriver,
+        hand: Hand,
+        config: LinkConfig,
+        *,
+        tap: Callable[[str, bytes], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self.driver, self.counts = driver, LinkCounts()
+        self.refusal: Refusal | None = None
+        self._hand, self._config, self._clock = hand, config, clock
+        self._block = driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)
+        self._tap = tap or (lambda direction, data: None)
+        self._generation, self._connected = 0, False
+        self._retry_at, self._pause = 0.0, config.backoff[0]
+
+    @property
+    def missing(self) -> list[str]:
+        """What this hand does not measure, names in `WITHOUT`."""
+        return [name for name in WITHOUT if name not in self.driver.measures]
+
+    def warnings(self) -> list[str]:
+        """One line for each thing that this hand does not measure."""
+        return [WITHOUT[name] for name in self.missing]
+
+    def connect(self) -> str:
+        """See `HandPort.connect`."""
+        try:
+            line = self.driver.connect()
+        except OSError as error:
+            raise HandError(f"the hand cannot be reached ({error}); check cable and power") from None
+        self._connected = True
+        self._generation += 1
+        return line
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        """See `HandPort.exchange`."""
+        self.refusal = None
+        try:
+            if not self._connected:
+                return self._reconnect()
+            return self._exchange(command)
+        except OSError:
+            self.counts.lost += self._connected
+            self.close()
+            self._retry_at = self._clock() + self._pause
+            self._pause = min(2 * self._pause, self._config.backoff[1])
+            return None
+
+    def close(self) -> None:
+        """Close the line. The motors keep doing what they were told last."""
+        self._connected = False
+        self.driver.close()
+
+    def _reconnect(self) -> Reply | None:
+        if self._clock() < self._retry_at:
+            time.sleep(_PAUSE)
+            return None
+        try:
+            self.connect()
+        except HandError as error:
+            raise OSError from error
+        self.counts.reconnects += 1
+        self._pause = self._config.backoff[0]
+        return self._exchange(passive_command(self._hand.num_joints))
+
+    def _exchange(self, command: np.ndarray) -> Reply | None:
+        self.counts.sent += 1
+        sent, on = self._clock(), bool(np.all(command["mode"] == Mode.POSITION))
+        self._tap("tx", Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes()).encode())
+        kp, ki, kd = (command[name].astype(float) for name in ("kp", "ki", "kd"))
+        self.driver.send(JointTargets(command["position"].astype(float), on, kp, ki, kd, command["torque_max"] * 1e-3))
+        state = self.driver.read()
+        received = self._clock()
+        if state is None:
+            self.counts.silent += 1
+            return None
+        block = self._pack(state)
+        self._tap("rx", Frame(palm_address(0), HOST, Command.EXCHANGE, block.tobytes()).encode())
+        if not on and np.any(state.on):
+            self.counts.refused += 1
+            self.refusal = Refusal("motors are on that were told to go off", serious=False)
+            return None
+        self.counts.answered += 1
+        return Reply(block, sent, received, self.counts.sent, self._generation)
+
+    def _pack(self, state: DriverState) -> np.ndarray:
+        """The block of a state. HandError: an array has another shape, or is missing."""
+        hand, measures = self._hand, self.driver.measures
+        joints, taxels = (hand.num_joints,), (hand.num_fingers, hand.num_taxels)
+        # What should be measured and is not would turn off a limit that the user counts on.
+        current = _checked("current", state.current, joints, "currents" in measures, np.nan)
+        heat = _checked("temperature", state.temperature, joints, "temperatures" in measures)
+        force = _checked("taxel_force", state.taxel_force, taxels, "taxels" in measures)
+        on = _checked("on", state.on, joints)
+        block = np.zeros((), self._block)
+        joint = block["joint"]
+        joint["id"] = np.arange(hand.num_joints)
+        joint["position"] = _checked("position", state.position, joints)
+        joint["raw_position"] = np.where(on, Mode.POSITION, Mode.PASSIVE)
+        joint["current"] = 1e3 * current
+        joint["temperature"] = np.clip(heat, 0, 255)
+        joint["joint_error"] = _checked("errors", state.errors, joints, state.errors is not None)
+        block["tip"]["taxel"]["z"] = force / NEWTONS_PER_COUNT
+        return block
+
+
+def _checked(
+    name: str, value: np.ndarray | None, shape: tuple[int, ...], measured: bool = True, absent: float = 0.0
+) -> np.ndarray:
+    """An array of a `DriverState`; `absent` in every place of one that the hand does not measure."""
+    if not measured:
+        return np.full(shape, absent)
+    array = np.asarray(value)
+    if array.shape != shape:
+        raise HandError(f"the driver's {name} has the shape {list(array.shape)}, expected {list(shape)}")
+    if not np.isfinite(array).all():
+        raise HandError(f"the driver's {name} is not finite; `read` returns None where it has no whole state")
+    return array

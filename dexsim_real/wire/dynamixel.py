@@ -1,0 +1,258 @@
+"""A driver for hands of Dynamixel motors, such as the LEAP Hand's sixteen XL330 or XC330: protocol 2.0 on pyserial.
+
+A file of your own tells port and motors, in the order of the joints in the hand's TOML; for `leap_like`:
+
+    # my_leap.py, for --port sdk:my_leap
+    from dexsim_real.wire.dynamixel import DynamixelHand
+
+    def open_hand(hand, link):
+        ids = [12, 13, 14, 15, 1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11]
+        return DynamixelHand("/dev/serial/by-id/...", ids, baud=4_000_000)
+
+Motors run in the current-based position mode: `--hardware.torque-max` is their goal current in mA, `--hardware.kp`,
+`ki` and `kd` are the registers of the position gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in
+the maker's tools. Packets, checksum and registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dexsim.core.install import install_line
+from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
+from dexsim_real.wire.driver import DriverState, JointTargets
+
+HEADER = b"\xff\xff\xfd\x00"
+BROADCAST = 0xFE
+READ_ALL, WRITE_ALL, STATUS = 0x82, 0x83, 0x55
+"""Instructions: sync read, sync write, and a motor's answer."""
+ALERT = 0x80
+"""Bit of an answer's error: the motor's hardware error status is not 0. The other bits say why a request failed."""
+POSITION_BY_CURRENT = 5
+"""Operating mode: position control within a current limit."""
+_STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
+_TICK = 2 * np.pi / 4096  # rad
+_MIDDLE = 2048  # ticks
+_MARGIN = 0.008  # s for the answers, besides their time on the wire
+_POLL = 0.001  # s, longest wait of one read
+_TRIES = 5  # at a motor's settings
+_LONGEST = 64  # bytes after the length of an answer; more in a header is damage
+_HEALTH_EVERY = 8  # reads between two looks at torque and errors of motors that report no alert
+
+
+class Register(NamedTuple):
+    """A range of the control table."""
+
+    address: int
+    dtype: np.dtype
+
+
+def _register(address: int, *fields: tuple[str, str]) -> Register:
+    return Register(address, np.dtype(list(fields)))
+
+
+SETTINGS = _register(9, ("return_delay", "u1"), ("drive_mode", "u1"), ("operating_mode", "u1"))
+CURRENT_LIMIT = _register(38, ("value", "<u2"))  # mA
+HEALTH = _register(64, ("torque", "u1"), ("between", "V5"), ("error", "u1"))
+TORQUE = _register(64, ("value", "u1"))
+GAINS = _register(80, ("kd", "<u2"), ("ki", "<u2"), ("kp", "<u2"))
+GOAL_CURRENT = _register(102, ("value", "<i2"))  # mA
+GOAL_POSITION = _register(116, ("value", "<i4"))  # ticks
+PRESENT = _register(
+    126, ("current", "<i2"), ("velocity", "<i4"), ("position", "<i4"), ("between", "V10"), ("temperature", "u1")
+)  # mA; 0.229 rev/min; ticks; degC
+
+
+def _crc_row(byte: int) -> int:
+    value = byte << 8
+    for _ in range(8):
+        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+    return value & 0xFFFF
+
+
+_CRC_ROWS = tuple(map(_crc_row, range(256)))
+
+
+def crc16(data: bytes | bytearray) -> int:
+    """CRC-16 of the protocol: polynomial 0x8005, start 0, not reflected; 0xFEE8 for b"123456789"."""
+    value = 0
+    for byte in data:
+        value = (value << 8 & 0xFFFF) ^ _CRC_ROWS[value >> 8 ^ byte]
+    return value
+
+
+def packet(motor: int, instruction: int, data: bytes) -> bytes:
+    """The bytes of a packet: `_PLAIN` in its content is followed by one more FD, so that no header appears there."""
+    body = (bytes([instruction]) + data).replace(_PLAIN, _STUFFED)
+    head = HEADER + bytes([motor]) + (len(body) + 2).to_bytes(2, "little") + body
+    return head + crc16(head).to_bytes(2, "little")
+
+
+class Answer(NamedTuple):
+    """A status packet."""
+
+    motor: int
+    error: int
+    data: bytes
+
+
+def take_answers(buffer: bytearray) -> list[Answer]:
+    """Remove the whole packets from the bytes received so far; returns the valid answers among them."""
+    answers = []
+    while (at := buffer.find(HEADER)) >= 0 and len(buffer) >= at + 7:
+        size = int.from_bytes(buffer[at + 5 : at + 7], "little")
+        end = at + 7 + size
+        if end > len(buffer) and size <= _LONGEST:
+            break
+        whole = buffer[at:end]
+        if size > _LONGEST or crc16(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
+            del buffer[: at + 1]  # No header, or one with a wrong length before a valid packet.
+            continue
+        body = bytes(whole[7:-2]).replace(_STUFFED, _PLAIN)
+        if body[0] == STATUS and len(body) >= 2:  # Others are the echo of an adapter.
+            answers.append(Answer(whole[4], body[1], body[2:]))
+        del buffer[:end]
+    return answers
+
+
+class DynamixelHand:
+    """`HandDriver` of a hand whose joints are one Dynamixel X motor each; `ids` are those of the motors.
+
+    Raises HandError: an id is given twice, or is none of a motor.
+    """
+
+    measures = frozenset({"currents", "temperatures"})
+
+    def __init__(self, port: str, ids: Sequence[int], baud: int = 4_000_000):
+        if len(set(ids)) < len(ids) or not set(ids) <= set(range(253)):
+            raise HandError(f"motor ids {list(ids)}: expected different numbers from 0 to 252")
+        self.port, self.ids, self.baud = port, list(ids), baud
+        self._serial: Any = None
+        self._written: dict[Register, np.ndarray] = {}  # what the motors have, of what changes rarely
+        self._limit = np.zeros(len(ids))  # [J] mA
+        self._on, self._look = False, 0  # what was commanded; reads until the next look at the motors' health
+        self._health = np.zeros(len(ids), HEALTH.dtype)
+
+    def connect(self) -> str:
+        """See `HandDriver.connect`. Motors are set to the current-based position mode, and to answer at once."""
+        self._open()
+        self._write(TORQUE, np.zeros(len(self.ids), TORQUE.dtype))  # Settings cannot be changed otherwise.
+        found = self._insist(SETTINGS)
+        wanted = found.copy()
+        wanted["return_delay"], wanted["operating_mode"] = 0, POSITION_BY_CURRENT
+        if not np.array_equal(found, wanted):
+            self._write(SETTINGS, wanted)
+            if not np.array_equal(self._insist(SETTINGS), wanted):
+                raise HandError(f"{self.port}: the motors do not keep their operating mode; power-cycle the hand")
+        self._limit = self._insist(CURRENT_LIMIT)["value"].astype(float)
+        self._written, self._on, self._look = {}, False, 0
+        return f"{self.port}: {len(self.ids)} Dynamixel motors, current limits {self._limit.min():.0f} mA or more"
+
+    def send(self, targets: JointTargets) -> None:
+        """See `HandDriver.send`. Motors come on after they have their first target."""
+        if targets.on != self._on:
+            self._look = 0
+        self._on = targets.on
+        if not targets.on:
+            self._write(TORQUE, np.zeros(len(self.ids), TORQUE.dtype))
+            self._written = {}
+            return
+        gains = np.zeros(len(self.ids), GAINS.dtype)
+        for name in ("kp", "ki", "kd"):
+            gains[name] = np.clip(getattr(targets, name), 0, 16383)
+        self._keep(GAINS, gains)
+        # A goal above the limit would be refused, without an answer.
+        self._keep(GOAL_CURRENT, _values(GOAL_CURRENT, np.minimum(1e3 * targets.current, self._limit)))
+        self._write(GOAL_POSITION, _values(GOAL_POSITION, np.round(targets.position / _TICK) + _MIDDLE))
+        self._keep(TORQUE, _values(TORQUE, np.ones(len(self.ids))))
+
+    def read(self) -> DriverState | None:
+        """See `HandDriver.read`."""
+        present, alert = self._read(PRESENT)
+        if present is None:
+            return None
+        if alert or not self._on or self._look <= 0:
+            health, _ = self._read(HEALTH)
+            if health is None:
+                return None
+            self._health, self._look = health, _HEALTH_EVERY
+        self._look -= 1
+        return DriverState(
+            position=(present["position"] - _MIDDLE) * _TICK,
+            on=self._health["torque"] == 1,
+            current=present["current"] * 1e-3,
+            temperature=present["temperature"],
+            errors=self._health["error"],
+        )
+
+    def close(self) -> None:
+        """See `HandDriver.close`."""
+        if self._serial is not None:
+            self._serial.close()
+            self._serial = None
+
+    def _open(self) -> None:
+        try:
+            import serial
+        except ImportError:
+            raise HandError(f"pyserial is missing: {install_line('real')}") from None
+        self.close()
+        try:
+            self._serial = serial.Serial(self.port, self.baud, timeout=_POLL, write_timeout=0.1, exclusive=True)
+        except PORT_ERRORS as error:
+            raise HandError(explain(self.port, error)) from None
+
+    def _insist(self, register: Register) -> np.ndarray:
+        """The values [J] of a register. HandError: a motor does not answer."""
+        for _ in range(_TRIES):
+            values, _ = self._read(register)
+            if values is not None:
+                return values
+        silent = [motor for motor in self.ids if motor not in self._answered]
+        raise HandError(
+            f"{self.port}: no answer of the motors {', '.join(map(str, silent)) or 'in time'}; check power and cables, "
+            f"the ids, and the baud rate (now {self.baud})"
+        )
+
+    def _read(self, register: Register) -> tuple[np.ndarray | None, bool]:
+        """The values [J] of a register, None unless all motors answer in time; and whether one reports an alert."""
+        size = register.dtype.itemsize
+        request = packet(BROADCAST, READ_ALL, _span(register) + bytes(self.ids))
+        self._serial.reset_input_buffer()
+        self._serial.write(request)
+        until = time.monotonic() + 10 * (len(request) + len(self.ids) * (size + 11)) / self.baud + _MARGIN
+        buffer, answers = bytearray(), dict[int, Answer]()
+        while len(answers) < len(self.ids) and time.monotonic() < until:
+            buffer += self._serial.read(max(self._serial.in_waiting, 1))
+            for answer in take_answers(buffer):
+                if answer.motor in self.ids and len(answer.data) == size and not answer.error & ~ALERT:
+                    answers[answer.motor] = answer
+        self._answered = set(answers)
+        if len(answers) < len(self.ids):
+            return None, False
+        data = b"".join(answers[motor].data for motor in self.ids)
+        return np.frombuffer(data, register.dtype), any(answer.error & ALERT for answer in answers.values())
+
+    def _write(self, register: Register, values: np.ndarray) -> None:
+        """Write the values [J] of a register; motors do not answer it."""
+        rows = b"".join(bytes([motor]) + value.tobytes() for motor, value in zip(self.ids, values, strict=True))
+        self._serial.write(packet(BROADCAST, WRITE_ALL, _span(register) + rows))
+
+    def _keep(self, register: Register, values: np.ndarray) -> None:
+        """Write values [J] unless the motors have them."""
+        if register not in self._written or not np.array_equal(self._written[register], values):
+            self._write(register, values)
+            self._written[register] = values
+
+
+def _span(register: Register) -> bytes:
+    return register.address.to_bytes(2, "little") + register.dtype.itemsize.to_bytes(2, "little")
+
+
+def _values(register: Register, values: np.ndarray) -> np.ndarray:
+    """An array [J] of a register with one field."""
+    array = np.zeros(len(values), register.dtype)
+    array["value"] = values
+    return array

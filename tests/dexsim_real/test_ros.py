@@ -1,0 +1,175 @@
+"""The ROS 2 node with a stand-in of rclpy: messages, commands through the safety, and how it ends."""
+
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rclpy_stand_in
+from untrained import untrained
+
+from dexsim import load_hand
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
+from dexsim_real import ros
+from dexsim_real.core.errors import HandError
+from dexsim_real.wire.driver import DriverState
+
+STEP = 0.012  # s
+
+
+class Follower:
+    """A driver whose joints go a third of the way at each answer, with one finger pressed."""
+
+    def __init__(self, hand, measures=("currents", "taxels")):
+        self.measures, self.hand, self.on, self.sent = frozenset(measures), hand, False, []
+        self.position = np.clip(0.2, hand.joint_lower, hand.joint_upper).astype(float)
+        self.force = np.zeros((hand.num_fingers, hand.num_taxels))
+
+    def connect(self):
+        return "a follower"
+
+    def send(self, targets):
+        self.on = targets.on
+        self.sent.append(targets)
+        if self.on:
+            self.position = self.position + (targets.position - self.position) / 3
+
+    def read(self):
+        joints = self.hand.num_joints
+        return DriverState(
+            self.position,
+            np.full(joints, self.on),
+            np.full(joints, -0.2) if "currents" in self.measures else None,
+            taxel_force=self.force if "taxels" in self.measures else None,
+        )
+
+    def close(self):
+        self.on = None
+
+
+@pytest.fixture
+def leap():
+    return load_hand("leap_like")
+
+
+@pytest.fixture
+def make(monkeypatch, leap):
+    """A node over a driver, whose exchange loop the test turns in its own time."""
+
+    def make(driver, policy="", options="--no-guard"):
+        monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
+        given = {"port": "sdk:my_sdk", "hand": "leap_like", "policy": str(policy), "options": options}
+        node = rclpy_stand_in.Node("dexsim_hand", **given)
+        rclpy_stand_in.install(monkeypatch, node, lambda node: None)
+        now = [0.0]
+        hand = ros.HandNode(node)
+        hand.loop.clock = hand.port._clock = lambda: now[0]
+        hand.loop.pace._sleep = lambda seconds: None
+        hand.loop.start = lambda: None
+        hand.start()
+
+        def turn(cycles, before=lambda: None):
+            for _ in range(cycles):
+                now[0] += STEP
+                before()
+                hand.loop.cycle()
+                for _, call in node.timers:
+                    call()
+
+        return node, hand, turn
+
+    return make
+
+
+def test_joint_states_wrenches_and_taxels_are_those_of_the_hand(make, leap):
+    driver = Follower(leap)
+    node, hand, turn = make(driver)
+    driver.force[1, 5:9] = 1.5
+    turn(12)
+    joints = node.topics["joint_states"][-1]
+    assert joints.name == list(leap.joint_names) and joints.header.stamp == "now"
+    np.testing.assert_allclose(joints.position, driver.position, atol=1e-6)
+    np.testing.assert_allclose(joints.effort, 0.2 * leap.torque_limit, rtol=1e-5)  # -0.2 A, by the default scale
+    array = node.topics["~/taxels"][-1]
+    assert [(dim.label, dim.size, dim.stride) for dim in array.layout.dim] == [("finger", 4, 192), ("taxel", 48, 48)]
+    np.testing.assert_allclose(np.reshape(array.data, (4, 48)), driver.force, rtol=1e-5)
+    # Against the palm frame's taxels: the same force and torque, turned into the frame of the tip's body.
+    pose = forward_kinematics(leap, hand.safety.sample.measured.joint_position)
+    force = -1.5 * np.array(taxel_normals(leap, pose))[1, 5:9]
+    lever = np.array(taxel_positions(leap, pose))[1, 5:9] - np.array(pose.body_position)[leap.tip_body[1]]
+    turned = np.array(pose.body_rotation)[leap.tip_body[1]]
+    wrench = node.topics["~/wrenches/index"][-1]
+    assert wrench.header.frame_id == leap.body_names[leap.tip_body[1]]
+    for vector, palm in ((wrench.wrench.force, force), (wrench.wrench.torque, np.cross(lever, force))):
+        np.testing.assert_allclose(turned @ [vector.x, vector.y, vector.z], palm.sum(0), atol=1e-5)
+    assert node.topics["~/wrenches/thumb"][-1].wrench.force.x == 0.0
+    shown = len(node.topics["joint_states"])
+    node.timers[0][1]()
+    assert len(node.topics["joint_states"]) == shown, "a measurement is published once"
+
+
+def test_commands_move_the_hand_within_the_safety_until_their_stream_ends(make, leap):
+    driver = Follower(leap)
+    node, hand, turn = make(driver, options="--no-guard --hardware.kp 600")
+    kind, take = node.subscriptions["~/commands"]
+    far = kind(data=(leap.joint_upper + 1.0).tolist())
+    turn(15, lambda: take(far))
+    assert not driver.on, "commands do not turn the motors on"
+    response = node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
+    assert response.success
+    begin = len(driver.sent)
+    turn(300, lambda: take(far))
+    sent = np.array([targets.position for targets in driver.sent[begin:] if targets.on])
+    assert np.abs(np.diff(sent, axis=0)).max() <= 7.0 * 0.03 + 1e-6 and np.abs(np.diff(sent, axis=0))[:10].max() < 0.01
+    np.testing.assert_allclose(sent[-1], leap.joint_upper - 0.03, atol=1e-5)
+    take(kind(data=[0.0] * 3))
+    assert "3 joint targets, expected 16" in node.said
+    turn(120)
+    assert hand.safety.latched and not driver.on, "nobody commands any more"
+    assert not node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace()).success
+
+
+def test_a_hand_without_taxels_or_currents_publishes_what_it_has(make, leap):
+    node, _, turn = make(Follower(leap, ()))
+    turn(3)
+    assert node.topics["joint_states"][-1].effort == []
+    assert node.topics["~/taxels"] == node.topics["~/wrenches/index"] == []
+    assert any("no taxels" in line for line in node.said) and any("no currents" in line for line in node.said)
+
+
+def test_a_policy_gives_the_targets_once_the_motors_are_on(make, leap, tmp_path):
+    driver = Follower(leap)
+    untrained(leap, tmp_path / "policy.msgpack")
+    node, hand, turn = make(driver, tmp_path / "policy.msgpack", "--no-guard --approach 0.5")
+    assert "~/commands" not in node.subscriptions
+    turn(20)
+    assert hand.policy.ticks == 0
+    node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
+    turn(150)
+    assert hand.policy.ticks > 50 and driver.on and not hand.safety.latched
+    node.services["~/motors"](SimpleNamespace(data=False), SimpleNamespace())
+    turn(2)
+    assert not driver.on
+    with pytest.raises(HandError, match="observes 'contact_force', and the hand has no taxels"):
+        make(Follower(leap, ["currents"]), tmp_path / "policy.msgpack")
+
+
+@pytest.mark.parametrize("way", [KeyboardInterrupt, RuntimeError])
+def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
+    """The command itself, with its thread."""
+    driver = Follower(leap)
+    monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
+    node = rclpy_stand_in.Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard --safety.stale 2")
+
+    def spin(node):
+        node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
+        while not driver.on:
+            time.sleep(0.01)
+        raise way("the end")
+
+    rclpy_stand_in.install(monkeypatch, node, spin)
+    monkeypatch.setattr(ros, "prepare_jax", lambda: None)
+    with pytest.raises(way):
+        ros.main()
+    assert driver.on is None and not driver.sent[-1].on and node.said[-1] == "destroyed"

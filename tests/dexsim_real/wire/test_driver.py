@@ -1,0 +1,225 @@
+"""Drivers of hands that are not the XHand: what their states become, what is checked, and what a hand cannot do."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from untrained import untrained
+
+from dexsim import load_hand
+from dexsim.observation import FIELDS, ObservationConfig, Readings, observe
+from dexsim_real.control.controller import Controller
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.motors_off import turn_off
+from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.core.errors import HandError
+from dexsim_real.loop import ExchangeLoop
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.readings import NEEDS
+from dexsim_real.wire.driver import WITHOUT, DriverPort, DriverState
+from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.link import LinkConfig, greet
+
+PERIOD = 0.012  # s
+MEASURED = {"current": "currents", "temperature": "temperatures", "taxel_force": "taxels"}
+
+
+@pytest.fixture(scope="module")
+def leap():
+    return load_hand("leap_like")
+
+
+class Scripted:
+    """A driver that gives the states it is told to, and keeps what was sent."""
+
+    def __init__(self, hand, measures=WITHOUT):
+        self.measures, self.sent, self.calls, self.failing = frozenset(measures), [], [], False
+        joints, taxels = hand.num_joints, (hand.num_fingers, hand.num_taxels)
+        self.state = DriverState(
+            position=np.clip(0.1, hand.joint_lower, hand.joint_upper).astype(float),
+            on=np.zeros(joints, bool),
+            current=np.zeros(joints) if "currents" in measures else None,
+            temperature=np.full(joints, 30.0) if "temperatures" in measures else None,
+            taxel_force=np.zeros(taxels) if "taxels" in measures else None,
+        )
+
+    def set(self, **values):
+        self.state = dataclasses.replace(self.state, **values)
+
+    def connect(self):
+        self.calls.append("connect")
+        if self.failing:
+            raise OSError("gone")
+        return "scripted"
+
+    def send(self, targets):
+        if self.failing:
+            raise OSError("gone")
+        self.sent.append(targets)
+        self.set(on=np.full(len(targets.position), targets.on))
+
+    def read(self):
+        return self.state
+
+    def close(self):
+        self.calls.append("close")
+
+
+def off(hand):
+    return HandSensing(hand, HardwareConfig()).command(np.zeros(hand.num_joints), Mode.PASSIVE)
+
+
+def opened(hand, driver, **options):
+    port = DriverPort(driver, hand, LinkConfig(backoff=(0.001, 0.002)), **options)
+    port.connect()
+    return port
+
+
+def test_a_state_arrives_in_si_units_and_a_command_leaves_in_them(leap):
+    driver, rng = Scripted(leap), np.random.default_rng(0)
+    state = {
+        "position": rng.uniform(-0.3, 1.0, 16),
+        "current": rng.uniform(-1, 1, 16),
+        "temperature": rng.integers(20, 90, 16).astype(float),
+        "taxel_force": rng.uniform(0.2, 2.0, (4, 48)),
+        "errors": np.arange(16),
+    }
+    driver.set(**state)
+    config = HardwareConfig(joint_sign=(-1.0,) * 16, joint_offset=(0.2,), kp=(600,), kd=(200,), torque_max=350)
+    sensing, port = HandSensing(leap, config), opened(leap, driver)
+    target = rng.uniform(-0.2, 0.5, 16)
+    reply = port.exchange(sensing.command(target, Mode.POSITION, stiffness=0.5))
+    measured = sensing.measure(reply.state)
+    np.testing.assert_allclose(measured.joint_position, 0.2 - state["position"], atol=1e-6)
+    np.testing.assert_allclose(measured.current, np.abs(state["current"]), rtol=1e-6)
+    np.testing.assert_allclose(measured.joint_torque, -state["current"], rtol=1e-6)  # The default scale: 1 A is 1.
+    np.testing.assert_array_equal(measured.temperature, [*state["temperature"], 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(measured.taxel_force, state["taxel_force"], rtol=1e-6)
+    np.testing.assert_array_equal(measured.errors, [[0, bits, 0] for bits in range(16)])
+    assert np.all(measured.mode == Mode.POSITION)
+    (sent,) = driver.sent
+    np.testing.assert_allclose(sent.position, 0.2 - target, atol=1e-6)
+    assert sent.on and np.all(sent.kp == 300) and np.all(sent.kd == 200) and sent.current == pytest.approx(0.35)
+    np.testing.assert_array_equal(sensing.decode(reply.state.tobytes()), reply.state)
+    with pytest.raises(HandError, match="HardwareConfig.kp: 3 values for 16 joints"):
+        HandSensing(leap, HardwareConfig(kp=(1, 2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"position": np.zeros(15)}, r"position has the shape \[15\], expected \[16\]"),
+        ({"taxel_force": np.zeros((4, 47))}, r"taxel_force has the shape \[4, 47\]"),
+        ({"taxel_force": None}, r"taxel_force has the shape \[\], expected \[4, 48\]"),
+        ({"current": None}, "current has the shape"),
+        ({"temperature": np.full(16, np.nan)}, "temperature is not finite"),
+        ({"current": np.full(16, np.inf)}, "current is not finite"),
+    ],
+)
+def test_a_state_that_does_not_keep_the_promise_is_refused(leap, values, says):
+    """A current that is said to be measured and is not would silently be no over-current."""
+    driver = Scripted(leap)
+    driver.set(**values)
+    with pytest.raises(HandError, match=f"the driver's {says}"):
+        opened(leap, driver).exchange(off(leap))
+
+
+def test_a_line_that_fails_is_connected_again_with_the_motors_off(leap):
+    driver = Scripted(leap)
+    port = opened(leap, driver)
+    on = HandSensing(leap, HardwareConfig()).command(np.zeros(16), Mode.POSITION)
+    assert port.exchange(on).generation == 1
+    driver.failing = True
+    assert [port.exchange(on) for _ in range(5)] == [None] * 5 and port.counts.lost == 1
+    driver.failing = False
+    while (reply := port.exchange(on)) is None:
+        pass
+    assert reply.generation == 2 and not driver.sent[-1].on and port.counts.reconnects == 1
+    assert driver.calls.count("connect") > 1
+    assert port.exchange(on).generation == 2 and driver.sent[-1].on
+
+
+def test_motors_count_as_off_only_when_the_hand_says_so(leap):
+    driver = Scripted(leap)
+    port = opened(leap, driver)
+    deaf = lambda targets: driver.set(on=np.arange(16) == 3)  # noqa: E731
+    driver.send, heard = deaf, driver.send
+    assert not turn_off(port, off(leap), 0.02) and "told to go off" in port.refusal.text
+    driver.send = heard
+    assert turn_off(port, off(leap), 0.02)
+
+
+def test_what_a_hand_does_not_measure_is_said_in_a_line_each(leap):
+    assert greet(DriverPort(Scripted(leap), leap, LinkConfig())) == ["scripted"]
+    lines = greet(DriverPort(Scripted(leap, ["currents"]), leap, LinkConfig()))
+    assert [line.split(":")[1] for line in lines[1:]] == [" no taxels", " no temperatures"]
+    assert "--safety.finger-force" in lines[1] and "--safety.temperature" in lines[2]
+    assert all(field in WITHOUT[need] for field, needs in NEEDS.items() for need in needs)
+
+
+@pytest.mark.parametrize(
+    ("measures", "observation", "says"),
+    [
+        (["currents"], {}, "observes 'contact_force', and the hand has no taxels"),
+        (["currents"], {"leave_out": ("contact_force",)}, "observes 'contact_centre', and the hand has no taxels"),
+        (["taxels"], {}, "observes 'joint_torque', and the hand has no currents"),
+        (["currents"], {"leave_out": ("contact_force", "contact_centre"), "add": ("finger_force",)}, "'finger_force'"),
+        (
+            [],
+            {"leave_out": ("joint_torque", "contact_force", "contact_centre")},
+            "corrects its command by the measured",
+        ),
+        ([], {"leave_out": ("joint_torque", "contact_force", "contact_centre"), "force_loop": False}, ""),
+    ],
+)
+def test_a_policy_that_observes_what_the_hand_cannot_measure_is_refused(leap, measures, observation, says):
+    controller, missing = Controller(untrained(leap, **observation), leap), set(WITHOUT) - set(measures)
+    if says:
+        with pytest.raises(HandError, match=says):
+            controller.check_measured(missing)
+    else:
+        controller.check_measured(missing)
+
+
+def test_the_fields_that_depend_on_touch_and_current_are_those_of_the_table(hand):
+    """By what `observe` does with other forces and torques, so that no new field can be forgotten."""
+    rng = np.random.default_rng(0)
+    given = {
+        "joint_position": np.clip(0.3, hand.joint_lower, hand.joint_upper),
+        "joint_torque": rng.uniform(0.2, 0.6, 12),
+        "taxel_force": rng.uniform(0.1, 0.3, (5, 120)),
+        **dict.fromkeys(("object_position", "object_velocity", "palm_gravity"), np.zeros(3)),
+        **dict.fromkeys(("object_quat", "goal_quat"), np.eye(4)[0]),
+        "command": np.array(0.5),
+        "last_action": np.zeros(12),
+        "past_actions": np.zeros((2, 12)),
+    }
+    others = {
+        "currents": {"joint_torque": rng.uniform(2, 6, 12)},
+        "taxels": {"taxel_force": rng.uniform(1, 3, (5, 120))},
+    }
+    for name in (name for name, field in FIELDS.items() if field.source != "simulator"):
+        seen = jax.jit(lambda values, name=name: observe(hand, Readings(**values), (name,), ObservationConfig()))
+        depends = {what for what, other in others.items() if not np.array_equal(seen(given), seen(given | other))}
+        assert depends == set(NEEDS.get(name, ())), name
+
+
+@pytest.mark.parametrize("measures", [tuple(WITHOUT), ()])
+def test_without_currents_no_joint_counts_as_deaf_or_stalled(leap, measures):
+    """A finger that stands far from its target: it draws nothing where that is measured, and may press otherwise."""
+    driver, clock = Scripted(leap, measures), [0.0]
+    port = opened(leap, driver, clock=lambda: clock[0])
+    safety = Safety(leap, SafetyConfig())
+    loop = ExchangeLoop(port, HandSensing(leap, HardwareConfig()), safety, 83.0, clock=lambda: clock[0])
+    target = driver.state.position + 0.5 * (np.arange(16) == 6)
+    for cycle in range(500):
+        clock[0] += PERIOD
+        if cycle == 20:
+            loop.engage()
+        # The other joints move, so the angles are not frozen.
+        driver.set(position=driver.state.position + 1e-3 * (np.arange(16) == 0) * (-1) ** cycle)
+        safety.set_target(target, clock[0])
+        loop.cycle()
+    assert bool(safety.latched) == bool(measures) and ("does not follow" in safety.latched) == bool(measures)
+    assert measures or safety.last[0] <= Reaction.CLIP
