@@ -18,7 +18,7 @@ from dexsim.core.errors import DexsimError
 from dexsim.core.files import temporary_beside
 from dexsim.core.install import require
 from dexsim.datasets.trajectory import Trajectory
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 VERSION = "v3.0"
 FPS = 30

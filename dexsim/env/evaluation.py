@@ -19,6 +19,8 @@ from dexsim.env.task import Task
 from dexsim.geometry import rotations
 from dexsim.render.snapshot import Snapshot
 
+jax.tree_util.register_dataclass(Snapshot)
+
 _POOL, _EPISODES = 0xE7A1, 0xE7A2  # streams of an evaluation's seed; training's pool has the seed's own key
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.core.errors import ConfigError, OtherEnvWarning
+from dexsim.hand.description import Hand
 from dexsim.hand.files import DEFAULT, find_hand
-from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 
 Record = dict[str, Any]

@@ -8,19 +8,16 @@ import io
 import tempfile
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from dexsim.core.files import write_atomic
-from dexsim.core.pytree import Array
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.render.panel import draw_panel, make_layout, read_outs, taxel_image
-from dexsim.render.picture import Pose, draw_scene
+from dexsim.render.picture import Pose, draw_scene, hand_poses
 from dexsim.render.raycast import Camera
 from dexsim.render.snapshot import Snapshot
 
@@ -86,7 +83,7 @@ def render_episode(
         raise ValueError("render_episode: no snapshots to draw")
     rate = rate or fps
     nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
-    snapshots = jax.tree.map(lambda x: x[nearest], snapshots)
+    snapshots = snapshots.map(lambda x: x[nearest])
     hand = getattr(env, "hand", None) or load_hand()
     if camera is None:
         camera = env.name if env.name in CAMERAS else "grasp"
@@ -99,7 +96,7 @@ def render_episode(
     poses = hand_poses(hand, snapshots.joint_position)
 
     def frame(t: int) -> np.ndarray:
-        return draw(jax.tree.map(lambda x: x[t], snapshots), poses[t])
+        return draw(snapshots.map(lambda x: x[t]), poses[t])
 
     return _write_video(frame, len(poses), Path(path), rate, size)
 
@@ -159,25 +156,10 @@ def _aimed(camera: Camera, hand: Hand) -> Camera:
     return dataclasses.replace(camera, target=tuple(moved.tolist()))
 
 
-@lru_cache(maxsize=4)
-def _kinematics(hand: Hand) -> Callable[[Array], tuple]:
-    def pose(joint_position):
-        links = forward_kinematics(hand, joint_position)
-        return (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links))
-
-    return jax.jit(jax.vmap(pose))
-
-
-def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
-    """Poses of T frames from joint angles [T, J], in one compiled call."""
-    arrays = [np.asarray(x) for x in _kinematics(hand)(joint_position)]
-    return [Pose(*(x[t] for x in arrays)) for t in range(len(joint_position))]
-
-
 def _finite(snapshot: Snapshot) -> Snapshot:
     """NumPy arrays with zeros for what is not finite (a broken simulation must still be shown), but for the target."""
-    arrays = jax.tree.map(np.asarray, snapshot)
-    clean = jax.tree.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x, arrays)
+    arrays = snapshot.map(np.asarray)
+    clean = arrays.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x)
     return dataclasses.replace(clean, target_force=arrays.target_force)
 
 
