@@ -126,9 +126,9 @@ _CARD = """# {task}, a policy for the hand {hand.name}
 
 Trained in simulation with dexsim. No action of it has been tried on your hand: begin with the motors' current limited.
 
-`policy.onnx` maps an observation to an action, {rate:g} times a second. `config.json` describes both, `calibration.toml` is
-a template to be filled by `dexsim calibrate`, and `sha256sum -c SHA256SUMS` checks the files. To run it,
-`pip install numpy onnxruntime`:
+`policy.onnx` maps an observation to an action, {rate:g} times a second. `config.json` describes both,
+`calibration.toml` is a template that `dexsim calibrate` fills, and `sha256sum -c SHA256SUMS` checks the files. To run
+it, `pip install numpy onnxruntime`:
 
 ```python
 {code}```
@@ -139,8 +139,8 @@ The observation has {size} values in SI units and the palm frame (fingers +z, pa
 |---|---|---|---|
 {rows}
 
-The action moves the targets of the joints, in the order of `joints` in `config.json`. Build the observation with the last
-action before you choose the next one.
+The action moves the targets of the joints, in the order of `joints` in `config.json`. Build the observation with the
+last action before you choose the next one.
 
 Training: {training}
 """

@@ -1,6 +1,6 @@
 """Records simulated episodes of a policy for other programs.
 
-    python -m dexsim_ppo.record grasp --lerobot data/grasp --episodes 16
+    python -m dexsim_ppo.record grasp --lerobot data/grasp --episodes 16 --pictures
     python -m dexsim_ppo.record rotate --rrd rotate.rrd --episodes 1
     python -m dexsim_ppo.record grasp --npz assets/episodes/grasp.npz --episodes 4    # what `dexsim demo` shows
 
@@ -9,6 +9,7 @@ writes the same formats from such a log. An .npz holds what the live view draws,
 """
 
 import dataclasses
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
+from PIL import Image
 
 from dexsim.core import cli
 from dexsim.core.compilation import jit
@@ -27,8 +29,12 @@ from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
+from dexsim.render.picture import draw_scene, hand_poses
+from dexsim.render.render import camera_of
 from dexsim.render.snapshot import Snapshot
 from dexsim_ppo.policy import Policy, act, load_policy
+
+_PICTURE = (320, 240)  # pixels
 
 
 def record(
@@ -62,6 +68,18 @@ def record(
     return trajectories, snapshots
 
 
+def draw_pictures(env: Any, snapshots: Snapshot) -> np.ndarray:
+    """PNG files [T], as bytes, of what a camera would see: hand and object, but neither forces nor goal."""
+    bare = dataclasses.replace(snapshots, taxel_force=np.zeros_like(snapshots.taxel_force), goal_rotation=None)
+    camera, files = camera_of(env.name, env.hand), []
+    for t, pose in enumerate(hand_poses(env.hand, snapshots.joint_position)):
+        frame = bare.map(lambda x, t=t: x[t])
+        file = io.BytesIO()
+        Image.fromarray(draw_scene(env.hand, env.primitive_kinds, frame, pose, camera, _PICTURE, 1.0)).save(file, "PNG")
+        files.append(file.getvalue())
+    return np.array(files, object)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordArguments(Config):
     """Options of `python -m dexsim_ppo.record`."""
@@ -70,6 +88,8 @@ class RecordArguments(Config):
     """A policy file, or the name of a shipped policy, such as grasp."""
     lerobot: Path | None = None
     """Folder for a dataset in the LeRobot format (extra `lerobot`), which must not exist yet; None writes none."""
+    pictures: bool = False
+    """Draw what a camera would see into the LeRobot dataset."""
     rrd: Path | None = None
     """Recording of the first episode for the rerun viewer (extra `rerun`); None writes none."""
     npz: Path | None = None
@@ -108,13 +128,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     numbers = {"episodes": arguments.episodes, "seconds": arguments.seconds, "seed": arguments.seed}
     trajectories, snapshots = record(policy, env, **numbers)
     if arguments.lerobot:
+        if arguments.pictures:
+            pairs = zip(trajectories, snapshots, strict=True)
+            trajectories = [dataclasses.replace(one, picture=draw_pictures(env, shown)) for one, shown in pairs]
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
         first, hand = trajectories[0], env.hand
         names = {"joint_position": hand.joint_names, "target": hand.joint_names}
         series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
-        for name in (field.name for field in dataclasses.fields(first) if field.name not in ("time", "taxel_force")):
+        for name in (*(name for name in READINGS if name != "taxel_force"), "target"):
             values = getattr(first, name).reshape(len(first.time), -1)
             series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
         show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)

@@ -85,8 +85,7 @@ def render_episode(
     nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
     snapshots = snapshots.map(lambda x: x[nearest])
     hand = getattr(env, "hand", None) or load_hand()
-    if camera is None:
-        camera = env.name if env.name in CAMERAS else "grasp"
+    camera = camera_of(env.name, hand) if camera is None else camera
     # One scale for the whole video, so that colours compare across frames; single spikes may saturate.
     loaded = snapshots.taxel_force[snapshots.taxel_force > 0]
     force_range = float(np.quantile(loaded, 0.995)) if loaded.size else None
@@ -146,6 +145,11 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         return np.concatenate([scene, panel], 1)
 
     return draw
+
+
+def camera_of(task: str, hand: Hand) -> Camera:
+    """The preset of a task, or the grasp's, aimed at this hand."""
+    return _aimed(CAMERAS.get(task, CAMERAS["grasp"]), hand)
 
 
 def _aimed(camera: Camera, hand: Hand) -> Camera:

@@ -1,6 +1,6 @@
 """Shows a shipped policy in the browser: simulated where JAX is installed, recorded episodes where it is not.
 
-    dexsim demo grasp
+dexsim demo grasp
 """
 
 from collections.abc import Sequence

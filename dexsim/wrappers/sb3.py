@@ -1,8 +1,8 @@
 """Our environments as a vector environment of Stable-Baselines3 (extra `sb3`).
 
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import VecMonitor
-    PPO("MlpPolicy", VecMonitor(SB3VecEnv(dexsim.make("grasp"), 64))).learn(1_000_000)
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
+PPO("MlpPolicy", VecMonitor(SB3VecEnv(dexsim.make("grasp"), 64))).learn(1_000_000)
 """
 
 from typing import Any

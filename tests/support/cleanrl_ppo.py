@@ -67,7 +67,9 @@ def train(envs, iterations, *, steps=32, epochs=4, minibatches=4, gamma=0.95, la
             if "episode" in info:
                 returns.extend(info["episode"]["r"][info["_episode"]])
         last = np.asarray(forward(params, observation)[2])
-        observations, actions, logps, values, rewards, ends, dones, valid = (np.stack(x) for x in zip(*rows, strict=True))
+        observations, actions, logps, values, rewards, ends, dones, valid = (
+            np.stack(x) for x in zip(*rows, strict=True)
+        )
         # The observation that follows a time limit is the episode's last: its value is the bootstrap.
         following = np.concatenate([values[1:], last[None]])
         delta = rewards + gamma * following * ~ends - values
