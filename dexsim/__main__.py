@@ -50,10 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         meant = "".join(f" (perhaps {near})" for near in difflib.get_close_matches(name, COMMANDS, n=1))
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
-    if name == "train":
-        cli.announce(cli.LOADING)
     if name not in WITHOUT_JAX:
         require("jax", "train", f"dexsim {name}")
+    if name == "train":
+        cli.announce(cli.LOADING)
     exit_on_interrupt()
     module = importlib.import_module(COMMANDS[name][0])
     restore_interrupt()

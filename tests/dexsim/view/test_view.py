@@ -188,7 +188,7 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
 # Everything that the base install leaves out is absent.
 WITHOUT_JAX = """
 import sys
-for name in ("jax", "jaxlib", "mujoco.mjx", "scipy", "matplotlib", "onnx", "rich.table"):
+for name in ("jax", "jaxlib", "mujoco.mjx", "scipy", "matplotlib", "onnx"):
     sys.modules[name] = None
 sys.argv = ["dexsim"]
 """
@@ -222,8 +222,8 @@ viewer.Viewer = Page
 for name in {shipped}:
     demo.main([name, "--port", "18090"])
 """)
-    shown = [line.split() for line in said if not line.startswith("open ")]
-    assert len(shown) == len(shipped) == len(said) // 2
+    shown = [line.split() for line in said if line.startswith(("grasp ", "rotate "))]
+    assert len(shown) == len(shipped)
     for camera, frames, touching, jax in shown:
         assert camera in ("grasp", "rotate") and int(frames) > 200 and (touching, jax) == ("True", "None")
 
