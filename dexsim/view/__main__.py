@@ -46,7 +46,7 @@ def open_source(arguments: ViewArguments) -> "Source":
 
     Raises:
       ConfigError: it is neither a policy nor a task.
-      DexsimError: JAX is missing; see the sources.
+      DexsimError: see the sources.
     """
     name = arguments.what
     if name.endswith(".npz"):
@@ -54,9 +54,6 @@ def open_source(arguments: ViewArguments) -> "Source":
         from dexsim.view.episodes import RecordedEpisodes
 
         return RecordedEpisodes(read_episodes(Path(name), arguments.hand))
-    require("jax", "train", f"showing {name}")
-    print(f"preparing {name}: compiling takes up to a minute, the first time", flush=True)
-    cli.enable_caches()
     if name.endswith(".log"):
         from dexsim.view.recording import Recording
 
@@ -96,7 +93,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def show(arguments: ViewArguments) -> int:
-    """Serve the page until Ctrl-C; returns 0."""
+    """Serve the page until Ctrl-C; returns 0.
+
+    Raises:
+      DexsimError: it needs JAX, which is missing; see `open_source`.
+    """
+    if not arguments.what.endswith(".npz"):
+        require("jax", "train", f"showing {arguments.what}")
+        print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)
+        cli.enable_caches()
     source = open_source(arguments)
     from dexsim.view.viewer import Viewer
 

@@ -12,5 +12,6 @@ OPTIONS = {
     "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
     "dexsim.check_hand": ("dexsim.check_hand:CheckHandArguments", ["leap_like"]),
     "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
+    "dexsim.view.demo": ("dexsim.view.demo:DemoArguments", []),
     "dexsim.randomization_check": ("dexsim.randomization_check.__main__:CheckArguments", []),
 }
