@@ -29,6 +29,7 @@ def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_terminati
     assert limits == {0: {False}, 1: {True}}
 
 
+@pytest.mark.slow
 def test_its_ppo_learns():
     env = VecNormalize(VecMonitor(SB3VecEnv(TinyEnv(), 32)), gamma=0.95)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=256, gamma=0.95, learning_rate=3e-3, seed=0, device="cpu")
