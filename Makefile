@@ -15,7 +15,7 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 
 # With an NVIDIA driver present, training goes to the GPU.
-EXTRAS ?= video,tb$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda)
+EXTRAS ?= train,video,tb$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda)
 comma := ,
 
 # One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.
@@ -68,7 +68,7 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[brax,video,tb,view,onnx,lerobot,gym,docs]" --group test
+	$(PIP) install --quiet --editable ".[train,brax,video,tb,onnx,lerobot,gym,docs]" --group test
 	@touch $@
 
 $(MUTABLE): $(TESTABLE)
@@ -82,5 +82,5 @@ $(DOCUMENTABLE): pyproject.toml | $(VENV)/.created
 
 # With the packages, since mypy reads the types of JAX and NumPy.
 $(LINTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable . --group lint
+	$(PIP) install --quiet --editable ".[train]" --group lint
 	@touch $@

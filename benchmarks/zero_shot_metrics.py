@@ -11,7 +11,7 @@ from dexsim.core.assets import asset_path
 from dexsim.core.errors import DexsimError
 from dexsim.core.statistics import mean, proportion, ratio
 from dexsim.force_loop import target_force
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.render.snapshot import Snapshot
 from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 from dexsim_real.twin.plant.shapes import matrix

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dexsim.env.evaluation import Evaluation, take_snapshot
     from dexsim.env.state import Start, State
     from dexsim.env.task import GroundTruth, Task
-    from dexsim.hand.kinematics import Hand
+    from dexsim.hand.description import Hand
     from dexsim.hand.load import load_hand
     from dexsim.objects.config import ObjectConfig
     from dexsim.observation import Readings, observe

@@ -10,15 +10,17 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
+from dexsim.core.install import require
 from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
 
 COMMANDS = {
     "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
     "train": ("dexsim_ppo.train", "train a task"),
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
+    "demo": ("dexsim.view.demo", "show a shipped policy in the browser, without JAX too"),
     "view": ("dexsim.view.__main__", "show a hand live in the browser"),
     "average": ("dexsim_ppo.average", "average policies that were fine-tuned from one"),
-    "export": ("dexsim_ppo.export", "write a policy as an ONNX model"),
+    "export": ("dexsim_ppo.export", "write a policy as an ONNX model or a bundle"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
     "run": ("dexsim_real.run.__main__", "run a policy on the hand"),
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
@@ -28,6 +30,7 @@ COMMANDS = {
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
 }
 """Module and purpose of each command."""
+WITHOUT_JAX = ("demo", "view")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         meant = "".join(f" (perhaps {near})" for near in difflib.get_close_matches(name, COMMANDS, n=1))
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
+    if name not in WITHOUT_JAX:
+        require("jax", "train", f"dexsim {name}")
     if name == "train":
         cli.announce(cli.LOADING)
     exit_on_interrupt()

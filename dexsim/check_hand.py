@@ -19,7 +19,8 @@ from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
-from dexsim.hand.kinematics import Hand, forward_kinematics, hinge_angles
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import forward_kinematics, hinge_angles
 from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp.config import GraspConfig

@@ -9,7 +9,8 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.force_loop import ForceLoop
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

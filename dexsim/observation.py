@@ -17,7 +17,8 @@ from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.geometry.mirror import AXIAL, POLAR, QUAT
-from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics, tip_twist
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
 from dexsim.hand.mirror import mirror_hand
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim.touch.reduce import reduce_touch_links

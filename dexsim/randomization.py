@@ -15,7 +15,7 @@ from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniforms
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 NOMINAL = {
     "stiffness_factor": 1.0,

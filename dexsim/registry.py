@@ -21,7 +21,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
 from dexsim.env.task import Task, check_task
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp import config as grasp
 from dexsim.tasks.grasp.task import Grasp

@@ -15,7 +15,7 @@ from dexsim.control import Control
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import correct_command
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.estimate import estimate_force

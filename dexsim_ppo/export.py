@@ -1,12 +1,16 @@
-"""Writes a policy as an ONNX model (extra `onnx`), which takes observations in SI units.
+"""Writes a policy as an ONNX model (extra `onnx`), which takes observations in SI units, alone or in a bundle: a folder
+or zip file with all that a robot's computer needs to run it, which is neither JAX nor this library.
 
     python -m dexsim_ppo.export grasp --output grasp.onnx
+    python -m dexsim_ppo.export grasp --bundle grasp.zip
 
 `dexsim_ppo.portable` runs a policy's own file without JAX.
 """
 
 import dataclasses
+import hashlib
 import json
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +19,14 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from dexsim.calibration.maps import blank_calibration, save_calibration
 from dexsim.core import cli
-from dexsim.core.files import write_atomic
+from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.core.files import temporary_beside, write_atomic
 from dexsim.core.install import require
+from dexsim.hand.description import Hand
+from dexsim.hand.load import load_hand
+from dexsim.observation import FIELDS
 from dexsim_ppo.policy import Policy, load_policy
 
 _OPSET = 17
@@ -96,14 +105,138 @@ def _onnx_gru(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
+_UNITS = {
+    "joint_position": "rad",
+    "joint_torque": "torque over the joint's torque limit, from calibrated current",
+    "object_position": "m",
+    "object_velocity": "m/s",
+    "contact_force": "N, sum of a finger's taxels",
+    "contact_centre": "m, mean position of a finger's taxels weighted by force; 0 without contact",
+    "finger_force": "N, from taxels and torque",
+    "fingertip_position": "m, by forward kinematics",
+    "fingertip_rotation": "first two columns of the rotation matrix",
+    "command": "grip command, 0 to 1",
+    "last_action": "the action before this observation; or the joint targets, -1 to 1 over their ranges",
+    "past_actions": "the two actions before the last, newest first",
+    "palm_gravity": "unit vector",
+    "relative_orientation": "rotation from object to goal, first two columns or (w, x, y, z)",
+    "object_orientation": "first two columns of the rotation matrix or (w, x, y, z)",
+}
+_CARD = """# {task}, a policy for the hand {hand.name}
+
+Trained in simulation with dexsim. No action of it has been tried on your hand: begin with the motors' current limited.
+
+`policy.onnx` maps an observation to an action, {rate:g} times a second. `config.json` describes both,
+`calibration.toml` is a template that `dexsim calibrate` fills, and `sha256sum -c SHA256SUMS` checks the files. To run
+it, `pip install numpy onnxruntime`:
+
+```python
+{code}```
+
+The observation has {size} values in SI units and the palm frame (fingers +z, palm normal +x, thumb side +y):
+
+| field | values | unit | measured by |
+|---|---|---|---|
+{rows}
+
+The action moves the targets of the joints, in the order of `joints` in `config.json`. Build the observation with the
+last action before you choose the next one.
+
+Training: {training}
+"""
+_CODE = """import json
+import numpy as np
+import onnxruntime
+config = json.load(open("config.json"))
+lower, upper = np.array([[joint["lower"], joint["upper"]] for joint in config["joints"]]).T
+session = onnxruntime.InferenceSession("policy.onnx")
+carry = {x.name: np.zeros((1, x.shape[1]), np.float32) for x in session.get_inputs()[1:]}  # empty without memory
+def act(observation, carry):
+    action, *after = session.run(None, {"observation": np.float32([observation]), **carry})
+    return action[0], dict(zip(carry, after))
+def move(target, action, measured):
+    target = np.clip(target + config["step"] * action, measured - config["reach"], measured + config["reach"])
+    return np.clip(target, lower, upper)  # rad
+"""
+
+
+def write_bundle(policy: Policy, path: Path) -> None:
+    """Write a folder, or a file where `path` ends in .zip, whole or not at all: the ONNX model, its configuration, a
+    template of the calibration, a card with the code that runs it, and the digests of these.
+
+    Raises:
+      ConfigError: the policy is of an environment without a hand.
+      DexsimError: onnx is not installed, or there is something at `path`.
+    """
+    if policy.spec is None:
+        raise ConfigError(f"--bundle {path}: the policy of {policy.task!r} is of no task on a hand; use --output")
+    if path.exists():
+        raise DexsimError(f"{path}: exists already; name another folder or file")
+    hand = policy.find_hand() or load_hand()
+    part = temporary_beside(path)
+    part.mkdir(parents=True)
+    try:
+        to_onnx(policy, part / "policy.onnx")
+        cli.write_json(part / "config.json", bundle_config(policy, hand))
+        save_calibration(part / "calibration.toml", blank_calibration(hand))
+        (part / "README.md").write_text(_card(policy, hand))
+        sums = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n" for file in sorted(part.iterdir())]
+        (part / "SHA256SUMS").write_text("".join(sums))
+        if path.suffix == ".zip":
+            Path(shutil.make_archive(str(part), "zip", part)).rename(path)
+        else:
+            part.rename(path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def bundle_config(policy: Policy, hand: Hand) -> dict[str, Any]:
+    """What a program on the robot reads: rate, fields of the observation, joints, and how an action moves them."""
+    assert policy.spec is not None, "a task on a hand"
+    limits = zip(hand.joint_names, hand.joint_lower, hand.joint_upper, hand.torque_limit, strict=True)
+    return {
+        "task": policy.task,
+        "hand": hand.name,
+        "control_rate": policy.control_rate,
+        "observation": [
+            {"name": entry.name, "size": entry.size, "unit": _UNITS[entry.name], "source": FIELDS[entry.name].source}
+            for entry in policy.observation_layout
+        ],
+        "joints": [
+            {"name": name, "lower": low, "upper": high, "torque_limit": torque} for name, low, high, torque in limits
+        ],
+        "step": policy.spec.control.step,
+        "reach": policy.spec.control.reach,
+        "spec": dataclasses.asdict(policy.spec),
+        "training": policy.training,
+    }
+
+
+def _card(policy: Policy, hand: Hand) -> str:
+    config = bundle_config(policy, hand)
+    rows = [f"| `{x['name']}` | {x['size']} | {x['unit']} | {x['source']} |" for x in config["observation"]]
+    origin = {name: value for name, value in policy.training.items() if isinstance(value, (int, float, str))}
+    return _CARD.format(
+        task=policy.task,
+        hand=hand,
+        rate=policy.control_rate,
+        code=_CODE,
+        size=sum(x["size"] for x in config["observation"]),
+        rows="\n".join(rows),
+        training=", ".join(f"{name} {value}" for name, value in origin.items()) or "see `config.json`",
+    )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportArguments:
     """Options of `python -m dexsim_ppo.export`."""
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
-    output: Path
-    """File to write."""
+    output: Path | None = None
+    """File of the model; None writes none."""
+    bundle: Path | None = None
+    """Folder, or file that ends in .zip, of the bundle, which must not exist yet; None writes none."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -112,13 +245,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         ExportArguments,
         sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim_ppo.export",
-        description="Write a policy as an ONNX model.",
+        description="Write a policy as an ONNX model, or as a bundle for a robot's computer.",
     )
-    cli.check_writable(arguments.output)
+    if arguments.output is None and arguments.bundle is None:
+        raise ConfigError("give --output FILE or --bundle FOLDER_OR_ZIP")
     policy = load_policy(arguments.policy)
-    to_onnx(policy, arguments.output)
+    if arguments.output:
+        cli.check_writable(arguments.output)
+        to_onnx(policy, arguments.output)
+    if arguments.bundle:
+        write_bundle(policy, arguments.bundle)
     sizes = ", ".join(f"{entry.name} {entry.size}" for entry in policy.observation_layout)
-    print(f"{arguments.output}: {policy.task}, {policy.control_rate:g} Hz; observation: {sizes}")
+    written = ", ".join(str(path) for path in (arguments.output, arguments.bundle) if path)
+    print(f"{written}: {policy.task}, {policy.control_rate:g} Hz; observation: {sizes}")
     return 0
 
 

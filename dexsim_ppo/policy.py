@@ -32,7 +32,7 @@ from dexsim_ppo.learner.types import Environment
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
-    from dexsim.hand.kinematics import Hand
+    from dexsim.hand.description import Hand
 
 
 @pytree_dataclass

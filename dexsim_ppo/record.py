@@ -1,13 +1,15 @@
 """Records simulated episodes of a policy for other programs.
 
-    python -m dexsim_ppo.record grasp --lerobot data/grasp --episodes 16
+    python -m dexsim_ppo.record grasp --lerobot data/grasp --episodes 16 --pictures
     python -m dexsim_ppo.record rotate --rrd rotate.rrd --episodes 1
+    python -m dexsim_ppo.record grasp --npz assets/episodes/grasp.npz --episodes 4    # what `dexsim demo` shows
 
-A recording holds what the hand's own sensors measured, as a log of a run on a hand does; `python -m dexsim_real.replay`
-writes the same formats from such a log.
+A dataset holds what the hand's own sensors measured, as a log of a run on a hand does; `python -m dexsim_real.replay`
+writes the same formats from such a log. An .npz holds what the live view draws, true poses included.
 """
 
 import dataclasses
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,20 +18,30 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
+from PIL import Image
 
 from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
+from dexsim.datasets.episodes import Episodes, write_episodes
 from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
+from dexsim.render.picture import draw_scene, hand_poses
+from dexsim.render.render import camera_of
+from dexsim.render.snapshot import Snapshot
 from dexsim_ppo.policy import Policy, act, load_policy
 
+_PICTURE = (320, 240)  # pixels
 
-def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int) -> list[Trajectory]:
-    """Trajectories of the first episodes of the task's evaluation, each until it ends or `seconds` are over.
+
+def record(
+    policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
+) -> tuple[list[Trajectory], list[Snapshot]]:
+    """Trajectories of the first episodes of the task's evaluation, each until it ends or `seconds` are over, and what a
+    picture of each of their ticks shows.
 
     Args:
       env: made for that many environments.
@@ -41,18 +53,31 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
         carry, action = act(policy.params, carry, state.obs["actor"])
         after = jax.vmap(env.step)(state, action)
         readings = {name: getattr(state.readings, name) for name in READINGS}
-        return (after, carry), (readings, after.joint_target, after.terminated)
+        return (after, carry), (readings, after.joint_target, after.terminated, jax.vmap(protocol.snapshot)(state))
 
     protocol = evaluation_of(env)
     starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(episodes, seed))
     run = jit(lambda begin: jax.lax.scan(tick, begin, None, length=ticks), backend=env.backend)
-    readings, target, ended = jax.device_get(run((starts, policy.initial_carry(episodes)))[1])
-    trajectories = []
+    readings, target, ended, shown = jax.device_get(run((starts, policy.initial_carry(episodes)))[1])
+    trajectories, snapshots = [], []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
         rows = [{name: values[t, i] for name, values in readings.items()} for t in range(length)]
         trajectories.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
-    return trajectories
+        snapshots.append(shown.map(lambda x, length=length, i=i: x[:length, i]))
+    return trajectories, snapshots
+
+
+def draw_pictures(env: Any, snapshots: Snapshot) -> np.ndarray:
+    """PNG files [T], as bytes, of what a camera would see: hand and object, but neither forces nor goal."""
+    bare = dataclasses.replace(snapshots, taxel_force=np.zeros_like(snapshots.taxel_force), goal_rotation=None)
+    camera, files = camera_of(env.name, env.hand), []
+    for t, pose in enumerate(hand_poses(env.hand, snapshots.joint_position)):
+        frame = bare.map(lambda x, t=t: x[t])
+        file = io.BytesIO()
+        Image.fromarray(draw_scene(env.hand, env.primitive_kinds, frame, pose, camera, _PICTURE, 1.0)).save(file, "PNG")
+        files.append(file.getvalue())
+    return np.array(files, object)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,8 +88,12 @@ class RecordArguments(Config):
     """A policy file, or the name of a shipped policy, such as grasp."""
     lerobot: Path | None = None
     """Folder for a dataset in the LeRobot format (extra `lerobot`), which must not exist yet; None writes none."""
+    pictures: bool = False
+    """Draw what a camera would see into the LeRobot dataset."""
     rrd: Path | None = None
     """Recording of the first episode for the rerun viewer (extra `rerun`); None writes none."""
+    npz: Path | None = None
+    """File (.npz) of the episodes for `dexsim view`; None writes none."""
     episodes: int = setting(8, unit="1", low=1, high=1024)
     """Number of episodes."""
     seconds: float = setting(8.0, unit="s", low=0.1, high=600.0)
@@ -83,8 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_ppo.record",
         description="Record simulated episodes of a policy for other programs.",
     )
-    if arguments.lerobot is None and arguments.rrd is None:
-        raise ConfigError("give --lerobot FOLDER or --rrd FILE")
+    if arguments.lerobot is None and arguments.rrd is None and arguments.npz is None:
+        raise ConfigError("give --lerobot FOLDER, --rrd FILE or --npz FILE")
     policy = load_policy(arguments.policy, task=arguments.task)
     # First what could be wrong after minutes of simulation.
     if arguments.lerobot:
@@ -92,21 +121,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.rrd:
         check_rerun()
         cli.check_writable(arguments.rrd)
+    if arguments.npz:
+        cli.check_writable(arguments.npz)
     cli.enable_caches()
     env = policy.make_env()
-    trajectories = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
+    numbers = {"episodes": arguments.episodes, "seconds": arguments.seconds, "seed": arguments.seed}
+    trajectories, snapshots = record(policy, env, **numbers)
     if arguments.lerobot:
+        if arguments.pictures:
+            pairs = zip(trajectories, snapshots, strict=True)
+            trajectories = [dataclasses.replace(one, picture=draw_pictures(env, shown)) for one, shown in pairs]
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
         first, hand = trajectories[0], env.hand
         names = {"joint_position": hand.joint_names, "target": hand.joint_names}
         series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
-        for name in (field.name for field in dataclasses.fields(first) if field.name not in ("time", "taxel_force")):
+        for name in (*(name for name in READINGS if name != "taxel_force"), "target"):
             values = getattr(first, name).reshape(len(first.time), -1)
             series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
         show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
+    if arguments.npz:
+        kinds, period = env.primitive_kinds, env.control_period
+        shown = Episodes(task=policy.task, hand=env.hand, period=period, kinds=kinds, snapshots=snapshots)
+        write_episodes(arguments.npz, shown)
+        print(f"episodes for dexsim view: {arguments.npz}")
     return 0
 
 

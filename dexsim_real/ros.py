@@ -26,7 +26,7 @@ from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.source import recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax

@@ -85,7 +85,7 @@ def test_no_text_sends_people_to_the_name_of_another_project():
     assert len(text) > 100
     found = r"""pip3? install[^`\n]*[ \t'"]dexsim(-xhand)?(?=[\s'"`\[=<>)]|$)|['"`]dexsim(-xhand)?\["""
     wrong = [path.name for path, content in text.items() if re.search(found, content, re.MULTILINE)]
-    assert wrong == ["pyproject.toml"], "there the extra `viz` names another extra"
+    assert wrong == ["pyproject.toml"], "there extras name `train`"
 
 
 @in_checkout

@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim.core.ranges import uniform
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.objects.config import INACTIVE_SIZE, PROPERTY_RANGES, SHAPES
 from dexsim.objects.params import ObjectParams, sample_object
 from dexsim.tasks.grasp.config import GraspConfig

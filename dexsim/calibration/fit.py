@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 from dexsim.calibration.joint import JointLines, JointPress, fit_joint
 from dexsim.calibration.maps import Calibration, Side, alignment, check_plausible
 from dexsim.core.errors import CalibrationError
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 _LOSSES = 0.3  # share by which a gear's losses may part the gains of the two directions
 

@@ -24,7 +24,7 @@ import numpy as np
 from dexsim.core.errors import CalibrationError
 from dexsim.core.files import read_toml, write_atomic
 from dexsim.core.pytree import Array, align, pytree_dataclass, static
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 FORMAT = "dexsim calibration"
 VERSION = 2
@@ -70,6 +70,25 @@ class Calibration:
     created: str = static(default="")
     notes: tuple[str, ...] = static(default=())
     force_per_torque: Array | None = None  # [3, F] N/Nm at the root joint: value, 95 % low, high; 0: not pressed
+
+
+def blank_calibration(hand: Hand) -> Calibration:
+    """A template of a hand's calibration: every measured number is NaN, which `load_calibration` refuses."""
+    shapes = {
+        field.name: hand.num_joints if field.name in _ONE_A_JOINT else (2, hand.num_joints)
+        for field in dataclasses.fields(Side)
+    }
+    side = Side(**{name: np.full(shape, np.nan) for name, shape in shapes.items()})
+    return Calibration(
+        real=side,
+        sim=side,
+        torque_scale=hand.torque_limit,
+        force_per_count=np.full(hand.num_fingers, np.nan),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+        notes=("a template: fill it with dexsim calibrate",),
+    )
 
 
 # --- run time -------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 
 MIN_LEVER = 0.005
 """m; joints with a shorter lever arm hardly feel the press and are left out."""

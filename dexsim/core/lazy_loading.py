@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from dexsim.core.install import install_line
+
 
 def lazy_exports(
     package: str, names: Sequence[str], homes: Mapping[str, str]
@@ -17,7 +19,12 @@ def lazy_exports(
     def getattribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(homes[name]), name)
+        try:
+            return getattr(importlib.import_module(homes[name]), name)
+        except ModuleNotFoundError as error:
+            if error.name != "jax":
+                raise
+            raise ImportError(f"{package}.{name} needs jax: {install_line('train')}") from None
 
     return getattribute, lambda: sorted(names)
 

@@ -3,9 +3,11 @@
 Touch is laid out as LeRobot's open proposal for tactile sensors has it (huggingface/lerobot, pull request 4469, in its
 state of August 2026): a feature `observation.tactile.NAME` for each sensor, a set of points with a force vector each,
 [N, 3] in N. Vectors are in the fingertip's frame; ours have only the part along the normal. Where the points are, m in
-that frame, is in `meta/tactile.json`, which is our own addition.
+that frame, is in `meta/tactile.json`, which is our own addition. LeRobot's ACT and Diffusion need the object's state,
+`observation.environment_state`, or pictures, which are PNG files in the table.
 """
 
+import io
 import json
 import shutil
 from collections.abc import Sequence
@@ -18,11 +20,13 @@ from dexsim.core.errors import DexsimError
 from dexsim.core.files import temporary_beside
 from dexsim.core.install import require
 from dexsim.datasets.trajectory import Trajectory
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 VERSION = "v3.0"
 FPS = 30
 """Frames a second: the format knows whole numbers only, so the nearest tick of each instant is taken."""
+_PICTURE = "observation.images.scene"
+_SAMPLED = 20  # pictures of an episode, at most, of which its statistics are
 _FILE = "chunk-000/file-000.parquet"
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
@@ -90,7 +94,7 @@ def _write(folder: Path, hand: Hand, task: str, whole: dict[str, np.ndarray], ep
 
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True)
-    table = pyarrow.table({name: pyarrow.array(values.tolist(), _type(values)) for name, values in whole.items()})
+    table = pyarrow.table({name: pyarrow.array(_rows(values), _type(values)) for name, values in whole.items()})
     parquet.write_table(table, folder / "data" / _FILE)
     parquet.write_table(pyarrow.Table.from_pylist(episodes), folder / "meta" / "episodes" / _FILE)
     pandas.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta" / "tasks.parquet")
@@ -103,16 +107,18 @@ def _write(folder: Path, hand: Hand, task: str, whole: dict[str, np.ndarray], ep
 
 
 def features_of(hand: Hand, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """The features of each frame [T, ...] by their names in the format; `action` is the joint targets, rad."""
+    """The features of each frame [T, ...] by their names in the format; `action` is the joint targets, rad, and the
+    state of the environment the object's pose and the force command."""
     force = trajectory.taxel_force[..., None] * -hand.taxel_normal
     count = len(trajectory.time)
     return {
         "observation.state": trajectory.joint_position,
         "observation.joint_torque": trajectory.joint_torque,
         **{f"observation.tactile.{name}": force[:, i].astype(np.float32) for i, name in enumerate(hand.finger_names)},
-        "observation.object_position": trajectory.object_position,
-        "observation.object_quat": trajectory.object_quat,
-        "observation.command": trajectory.command,
+        "observation.environment_state": np.concatenate(
+            [trajectory.object_position, trajectory.object_quat, trajectory.command[:, None]], -1
+        ),
+        **({} if trajectory.picture is None else {_PICTURE: trajectory.picture}),
         "action": trajectory.target,
         "timestamp": (np.arange(count) / FPS).astype(np.float32),
         "frame_index": np.arange(count, dtype=np.int64),
@@ -125,8 +131,12 @@ def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str
         "observation.state": joints,
         "observation.joint_torque": joints,
         "action": joints,
-        "observation.object_position": ["x", "y", "z"],
-        "observation.object_quat": ["w", "x", "y", "z"],
+        "observation.environment_state": [
+            *(f"object_position_{axis}" for axis in "xyz"),
+            *(f"object_quat_{part}" for part in "wxyz"),
+            "command",
+        ],
+        _PICTURE: ["height", "width", "channels"],
         **{f"observation.tactile.{name}": force for name in hand.finger_names},
     }
     return {
@@ -143,8 +153,8 @@ def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": None,
         "features": {
-            name: {"dtype": values.dtype.name, "shape": list(values.shape[1:]) or [1], "names": names.get(name)}
-            for name, values in columns.items()
+            name: {"dtype": dtype, "shape": shape, "names": names.get(name)}
+            for name, (dtype, shape) in {name: _format(values) for name, values in columns.items()}.items()
         },
     }
 
@@ -186,7 +196,13 @@ def _episode(number: int, begin: int, length: int, task: str, frames: dict[str, 
 
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
-    """Minimum, maximum, mean, deviation and quantiles over frames; scalars are lists of one number."""
+    """Minimum, maximum, mean, deviation and quantiles over frames; scalars are lists of one number. Those of
+    pictures are [3, 1, 1], of each channel in [0, 1]."""
+    if values.dtype == object:
+        some = values[np.linspace(0, len(values) - 1, min(len(values), _SAMPLED)).astype(int)]
+        pixels = np.concatenate([_pixels(picture).reshape(-1, 3) for picture in some]) / 255
+        channels = _statistics(pixels) | {"count": [len(some)]}
+        return {name: x if name == "count" else np.reshape(x, (3, 1, 1)).tolist() for name, x in channels.items()}
     values = np.asarray(values, float)
     values = values[:, None] if values.ndim == 1 else values
     summary = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
@@ -194,10 +210,30 @@ def _statistics(values: np.ndarray) -> dict[str, Any]:
     return {name: value.tolist() for name, value in summary.items()} | {"count": [len(values)]}
 
 
+def _pixels(picture: bytes) -> np.ndarray:
+    """uint8 [H, W, 3]."""
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(picture)))
+
+
+def _format(values: np.ndarray) -> tuple[str, list[int]]:
+    """Type and shape of a feature."""
+    if values.dtype == object:
+        return "image", list(_pixels(values[0]).shape)
+    return values.dtype.name, list(values.shape[1:]) or [1]
+
+
+def _rows(values: np.ndarray) -> list:
+    return [{"bytes": picture} for picture in values] if values.dtype == object else values.tolist()
+
+
 def _type(values: np.ndarray) -> Any:
-    """Nested lists of the array's own number type."""
+    """Nested lists of the array's own number type; a picture's file as Hugging Face's data sets have it."""
     import pyarrow
 
+    if values.dtype == object:
+        return pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
     kind = pyarrow.from_numpy_dtype(values.dtype)
     for _ in values.shape[1:]:
         kind = pyarrow.list_(kind)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.core.install import install_line
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.render.panel import taxel_image
 
 Series = Mapping[str, tuple[Sequence[str], np.ndarray]]

@@ -18,13 +18,15 @@ class Trajectory:
     object_quat: np.ndarray  # [T, 4] (w, x, y, z), as estimated
     command: np.ndarray  # [T] in [0, 1]
     target: np.ndarray  # [T, J] rad
+    picture: np.ndarray | None = None  # [T] of a camera, each a PNG file's bytes
 
     def at_rate(self, rate: float) -> "Trajectory":
         """The same at another rate, Hz: of each instant the nearest tick."""
         instants = np.arange(int(self.time[-1] * rate) + 1) / rate
         nearest = np.rint(np.interp(instants, self.time, np.arange(len(self.time)))).astype(int)
-        fields = {field.name: getattr(self, field.name)[nearest] for field in dataclasses.fields(self)}
-        return Trajectory(**fields | {"time": instants})
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        picked = {name: None if values is None else values[nearest] for name, values in fields.items()}
+        return Trajectory(**picked | {"time": instants})
 
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat", "command")

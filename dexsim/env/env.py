@@ -28,7 +28,8 @@ from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
 from dexsim.task_spec import TaskSpec, correct_readings

@@ -9,7 +9,7 @@ from dexsim.env.config import EnvConfig
 from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Episode
 from dexsim.env.task import Task
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.objects.config import PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.randomization import sample_hand, tilted_down

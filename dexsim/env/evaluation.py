@@ -18,6 +18,8 @@ from dexsim.env.state import Start, State
 from dexsim.geometry import rotations
 from dexsim.render.snapshot import Snapshot
 
+jax.tree_util.register_dataclass(Snapshot)
+
 _POOL, _EPISODES = 0xE7A1, 0xE7A2  # streams of an evaluation's seed; training's pool has the seed's own key
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, drive
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.hand.kinematics import Hand, hinge_angles
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import hinge_angles
 from dexsim.hand.mjcf import read_mjcf
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState, TorqueLaw

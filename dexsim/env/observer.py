@@ -7,7 +7,7 @@ import jax
 from dexsim import observation
 from dexsim.env.config import EnvConfig
 from dexsim.env.task import GroundTruth, Task
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.observation import Motion, Readings
 
 

@@ -9,7 +9,7 @@ from dexsim.env.config import EnvConfig
 from dexsim.env.state import Episode, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.observation import Readings
 from dexsim.randomization import tilted_down
 from dexsim.sensing.imu import measure_orientation

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from dexsim.env.config import EnvConfig
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams
 from dexsim.objects.touch_geometry import touch_geometry
 from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals

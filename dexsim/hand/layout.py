@@ -21,8 +21,6 @@ import numpy as np
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import write_atomic
-from dexsim.geometry import sdf
-from dexsim.geometry.distance import signed_distance
 
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
@@ -146,6 +144,8 @@ def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name:
     Raises:
       AssetError: names the deepest one.
     """
+    from dexsim.geometry.distance import signed_distance  # JAX, which reading a layout does without
+
     distance = np.asarray(signed_distance(np.asarray(patch.position, np.float32), geometry))
     _refuse(name, patch, distance < -tolerance, -distance, f"lies {-1e3 * distance.min():.2g} mm inside its link")
 
@@ -158,6 +158,9 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
     Raises:
       AssetError: a taxel is inside its link (`check_outside`), away from it, or faces inwards.
     """
+    from dexsim.geometry import sdf
+    from dexsim.geometry.distance import signed_distance
+
     for finger, name in enumerate(hand.finger_names):
         geometry = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
         if geometry is None:

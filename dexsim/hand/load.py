@@ -10,8 +10,8 @@ import numpy as np
 from dexsim.core.config import Config, from_dict, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
+from dexsim.hand.description import Geom, Hand
 from dexsim.hand.files import digest_of, find_hand, shipped_name
-from dexsim.hand.kinematics import Geom, Hand
 from dexsim.hand.layout import MOST, lattice, on_surface, placed, read_taxels
 
 _SLACK = 1e-3  # rad, how far a posture or a follower may be beyond a joint's range

@@ -26,8 +26,8 @@ from dexsim.core import cli
 from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
 from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR
+from dexsim.hand.description import Hand
 from dexsim.hand.files import find_hand
-from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 
 OTHER = {"right": "left", "left": "right"}

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 
 def read_mjcf(hand: Hand) -> mujoco.MjSpec:

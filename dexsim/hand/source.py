@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
+from dexsim.hand.description import Hand
 from dexsim.hand.files import DEFAULT, find_hand
-from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.mirror import is_mirror_image
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 MARGIN = 0.05
 """rad, kept from the joint's limits."""

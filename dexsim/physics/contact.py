@@ -17,7 +17,8 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.core.pytree import Array
 from dexsim.geometry import rotations, sdf
-from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams
 
 # One sphere's share of a fingertip's stiffness: two or three of a row touch at once.

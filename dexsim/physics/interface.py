@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.objects.params import ObjectParams, bounding_radius
 from dexsim.physics.config import PhysicsConfig
 

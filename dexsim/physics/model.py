@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from dexsim.core.errors import AssetError
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.mjcf import read_mjcf
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig

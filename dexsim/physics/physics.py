@@ -14,7 +14,8 @@ import numpy as np
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.core.pytree import choose
-from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
 from dexsim.physics.c_backend import CBackend

@@ -16,6 +16,10 @@ import numpy as np
 from dexsim.render.snapshot import Snapshot
 
 INK, FAINT, PANEL, EMPTY, ACCENT = ((233, 236, 241), (138, 146, 160), (24, 27, 33), (40, 44, 53), (94, 196, 255))
+# matplotlib's colour map at even steps from 0.12, since the darkest eighth would vanish on the dark panel.
+_INFERNO = """
+1e0c45 380962 510e6c 69166e 801f6c 982766 b0315b c63d4d d94d3d e9612b f47918 fa9407 fcb014 f8cd37 f2ea69 fcffa4
+"""
 _GAP = 1  # pixels between two cells
 TRUE, FELT = ("maps: felt force", "bars: true force"), ("maps: felt force", "bars: their sum")
 """Captions of a panel whose bars show the simulation's contact forces, or what the taxels feel."""
@@ -62,10 +66,10 @@ def force_color(force: np.ndarray, force_range: float) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _color_table() -> np.ndarray:
-    import matplotlib  # only the colour table; pyplot is never needed here
-
-    # The darkest eighth would vanish on the dark panel.
-    return (matplotlib.colormaps["inferno"](np.linspace(0.12, 1.0, 256))[:, :3] * 255).round().astype(np.uint8)
+    known = np.array([tuple(bytes.fromhex(color)) for color in _INFERNO.split()])
+    place = np.linspace(0, len(known) - 1, 256)
+    table = [np.interp(place, np.arange(len(known)), channel) for channel in known.T]
+    return np.stack(table, -1).round().astype(np.uint8)
 
 
 @lru_cache(maxsize=8)

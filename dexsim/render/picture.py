@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.render.camera import Camera, CameraView, look, unit
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, linear
 from dexsim.render.panel import force_color
@@ -53,6 +53,31 @@ class Surface(NamedTuple):
     depth: np.ndarray  # [H, W] m, 1e6 where empty
     index: np.ndarray  # [H, W] int, primitive, -1 where empty
     normal: np.ndarray  # [H, W, 3] unit, outward
+
+
+def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
+    """Poses of T frames from joint angles [T, J] rad, by MuJoCo."""
+    model, data = _plant(hand)
+    bodies = [model.body(name).id for name in hand.body_names]
+    moving = np.flatnonzero(hand.body_joint >= 0)
+    hinges = model.jnt_qposadr[model.body_jntadr[np.array(bodies)[moving]]]
+    poses = []
+    for angles in np.asarray(joint_position, float):
+        data.qpos[hinges] = angles[hand.body_joint[moving]] * hand.body_ratio[moving] + hand.body_offset[moving]
+        mujoco.mj_kinematics(model, data)
+        palm = data.xmat[bodies[0]].reshape(3, 3)
+        position = (data.xpos[bodies] - data.xpos[bodies[0]]) @ palm
+        rotation = palm.T @ data.xmat[bodies].reshape(-1, 3, 3)
+        tips = rotation[hand.tip_body].swapaxes(-1, -2)
+        taxels = position[hand.tip_body, None] + hand.taxel_position @ tips
+        poses.append(Pose(*(x.astype(np.float32) for x in (position, rotation, taxels, hand.taxel_normal @ tips))))
+    return poses
+
+
+@lru_cache(maxsize=4)
+def _plant(hand: Hand) -> tuple[Any, Any]:
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    return model, mujoco.MjData(model)
 
 
 def draw_scene(

@@ -8,20 +8,17 @@ import io
 import tempfile
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from dexsim.core.files import write_atomic
-from dexsim.core.pytree import Array
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.render.camera import Camera
 from dexsim.render.panel import draw_panel, make_layout, read_outs, taxel_image
-from dexsim.render.picture import Pose, draw_scene
+from dexsim.render.picture import Pose, draw_scene, hand_poses
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {
@@ -86,10 +83,9 @@ def render_episode(
         raise ValueError("render_episode: no snapshots to draw")
     rate = rate or fps
     nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
-    snapshots = jax.tree.map(lambda x: x[nearest], snapshots)
+    snapshots = snapshots.map(lambda x: x[nearest])
     hand = getattr(env, "hand", None) or load_hand()
-    if camera is None:
-        camera = env.name if env.name in CAMERAS else "grasp"
+    camera = camera_of(env.name, hand) if camera is None else camera
     # One scale for the whole video, so that colours compare across frames; single spikes may saturate.
     loaded = snapshots.taxel_force[snapshots.taxel_force > 0]
     force_range = float(np.quantile(loaded, 0.995)) if loaded.size else None
@@ -99,7 +95,7 @@ def render_episode(
     poses = hand_poses(hand, snapshots.joint_position)
 
     def frame(t: int) -> np.ndarray:
-        return draw(jax.tree.map(lambda x: x[t], snapshots), poses[t])
+        return draw(snapshots.map(lambda x: x[t]), poses[t])
 
     return _write_video(frame, len(poses), Path(path), rate, size)
 
@@ -151,6 +147,11 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
     return draw
 
 
+def camera_of(task: str, hand: Hand) -> Camera:
+    """The preset of a task, or the grasp's, aimed at this hand."""
+    return _aimed(CAMERAS.get(task, CAMERAS["grasp"]), hand)
+
+
 def _aimed(camera: Camera, hand: Hand) -> Camera:
     """A preset, moved as far as the grasps of this hand are from those of the shipped one."""
     if not hand.grasp_centre:
@@ -159,25 +160,10 @@ def _aimed(camera: Camera, hand: Hand) -> Camera:
     return dataclasses.replace(camera, target=tuple(moved.tolist()))
 
 
-@lru_cache(maxsize=4)
-def _kinematics(hand: Hand) -> Callable[[Array], tuple]:
-    def pose(joint_position):
-        links = forward_kinematics(hand, joint_position)
-        return (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links))
-
-    return jax.jit(jax.vmap(pose))
-
-
-def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
-    """Poses of T frames from joint angles [T, J], in one compiled call."""
-    arrays = [np.asarray(x) for x in _kinematics(hand)(joint_position)]
-    return [Pose(*(x[t] for x in arrays)) for t in range(len(joint_position))]
-
-
 def _finite(snapshot: Snapshot) -> Snapshot:
     """NumPy arrays with zeros for what is not finite (a broken simulation must still be shown), but for the target."""
-    arrays = jax.tree.map(np.asarray, snapshot)
-    clean = jax.tree.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x, arrays)
+    arrays = snapshot.map(np.asarray)
+    clean = arrays.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x)
     return dataclasses.replace(clean, target_force=arrays.target_force)
 
 

@@ -1,13 +1,16 @@
 """What one frame of video shows."""
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any
 
-from dexsim.core.pytree import pytree_dataclass
 
-
-@pytree_dataclass
+@dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """What a picture shows. K primitives (object frame), F fingers of N taxels; stack along T for a video."""
+    """What a picture shows. K primitives (object frame), F fingers of N taxels; stack along T for a video.
+
+    A pytree where `dexsim.env.evaluation` takes it.
+    """
 
     joint_position: Any  # [J] rad
     object_position: Any  # [3] m, palm frame
@@ -23,3 +26,8 @@ class Snapshot:
     goal_rotation: Any = None  # [3, 3] orientation that the object is asked for; None for a task without goals
     turns: Any = None  # [] int32 goals reached since the episode began; None for a task without goals
     seconds: Any = None  # [] s since the episode began; None where nobody counts
+
+    def map(self, change: Callable[[Any], Any]) -> "Snapshot":
+        """With every array changed, such as `stacked.map(lambda x: x[0])`."""
+        arrays = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return Snapshot(**{name: None if array is None else change(array) for name, array in arrays.items()})

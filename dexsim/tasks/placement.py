@@ -7,7 +7,8 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.core.pytree import align
 from dexsim.geometry import rotations, sdf
-from dexsim.hand.kinematics import Hand, flexion_joints, forward_kinematics
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import flexion_joints, forward_kinematics
 
 
 def palm_height(hand: Hand) -> float:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, setting
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

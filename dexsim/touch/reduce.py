@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose
 
 
 def reduce_touch(force: jax.Array, taxels: jax.Array, weighting: str = "force") -> tuple[jax.Array, jax.Array]:

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.geometry.distance import signed_distance
-from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import HandPose
 from dexsim.touch.skin import Skin, skin_stress
 
 

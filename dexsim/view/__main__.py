@@ -2,7 +2,7 @@
 
     python -m dexsim.view grasp
 
-Shown is a simulation with a policy, the emulated hand (`--emulated`), or the log of a run on a hand.
+Shown is a simulation with a policy, the emulated hand (`--emulated`), the log of a run on a hand, or recorded episodes.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ class ViewArguments(Config):
     """Options of `python -m dexsim.view`."""
 
     what: Annotated[str, tyro.conf.Positional]
-    """Policy file, name of a shipped policy or of a task (my_module:poke for one of your own), or log file (.log) of a
-    run on a hand."""
+    """Policy file, name of a shipped policy or of a task (my_module:poke for one of your own), log file (.log) of a run
+    on a hand, or episodes (.npz) of `dexsim record`, for which JAX need not be installed."""
     emulated: bool = False
     """Run the policy on the emulated hand instead of the simulation that it was trained in."""
     hand: str = ""
@@ -49,6 +49,11 @@ def open_source(arguments: ViewArguments) -> "Source":
       DexsimError: see the sources.
     """
     name = arguments.what
+    if name.endswith(".npz"):
+        from dexsim.datasets.episodes import read_episodes
+        from dexsim.view.episodes import RecordedEpisodes
+
+        return RecordedEpisodes(read_episodes(Path(name), arguments.hand))
     if name.endswith(".log"):
         from dexsim.view.recording import Recording
 
@@ -84,14 +89,24 @@ def open_source(arguments: ViewArguments) -> "Source":
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     description = "Show a hand live in the browser."
-    arguments = cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description)
-    # First what is quick to find out: JAX takes seconds to import, the simulation up to a minute to compile.
-    require("viser", "view", "the live view")
-    print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)
+    return show(cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description))
+
+
+def show(arguments: ViewArguments) -> int:
+    """Serve the page until Ctrl-C; returns 0.
+
+    Raises:
+      DexsimError: it needs JAX, which is missing; see `open_source`.
+    """
+    if not arguments.what.endswith(".npz"):
+        require("jax", "train", f"showing {arguments.what}")
+        print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)
+        cli.enable_caches()
+    source = open_source(arguments)
     from dexsim.view.viewer import Viewer
 
-    cli.enable_caches()
-    viewer = Viewer(open_source(arguments), title=f"dexsim: {arguments.what}", host=arguments.host, port=arguments.port)
+    title = f"dexsim: {Path(arguments.what).stem}"
+    viewer = Viewer(source, title=title, host=arguments.host, port=arguments.port)
     print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
     viewer.run()
     return 0

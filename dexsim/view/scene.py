@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.render.camera import look
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
-from dexsim.render.picture import Pose
-from dexsim.render.render import CAMERAS, hand_poses
+from dexsim.render.picture import Pose, hand_poses
+from dexsim.render.render import CAMERAS
 from dexsim.view.source import Frame
 
 _IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.render.snapshot import Snapshot
 
 

@@ -1,13 +1,14 @@
-"""Our environments as one Gymnasium vector environment, for trainers of other libraries (extra `gym`).
+"""Our environments behind Gymnasium's interfaces, for trainers of other libraries (extra `gym`).
 
     env = GymVectorEnv(dexsim.make("grasp"), 64)
     observation, info = env.reset(seed=0)
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-All environments step in one compiled call. A finished one restarts in the same step: `observation` is then the first
-of the new episode, and `info["final_obs"]` has the last of the old one (Gymnasium's `SAME_STEP` mode).
+All environments step in one compiled call. `GymEnv` is a single one.
 """
 
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,13 +18,18 @@ from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.env import Env
+from dexsim.env.evaluation import take_snapshot
+from dexsim.render.render import camera_of, render_frame
 
 try:
+    import gymnasium
     from gymnasium import spaces
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
     raise ImportError(f"dexsim.wrappers.gymnasium needs gymnasium: {install_line('gym')}") from error
+
+_RENDER_MODES = (None, "rgb_array")
 
 
 class GymVectorEnv(VectorEnv):
@@ -33,43 +39,75 @@ class GymVectorEnv(VectorEnv):
       env: what `dexsim.make` returns.
       num_envs: environments side by side.
       observation_group: "actor" or "critic".
+      autoreset_mode: when a finished environment restarts. `SAME_STEP`: at once; `observation` is then the first of the
+        new episode, and `info["final_obs"]` has the last of the old one. `NEXT_STEP`: in the step after, which ignores
+        its action and earns nothing; Gymnasium's wrappers, such as `NormalizeObservation`, need this mode.
+      render_mode: "rgb_array" for pictures by `render`; None for none.
 
     Raises:
-      ConfigError: no such group.
+      ConfigError: no such group, autoreset mode or render mode.
     """
 
-    def __init__(self, env: Env, num_envs: int, observation_group: str = "actor"):
-        if observation_group not in env.observation_layout:
-            groups = ", ".join(env.observation_layout)
-            raise ConfigError(f"no observation group {observation_group!r}: choose from {groups}")
-        self.env, self.num_envs, self._group = env, num_envs, observation_group
+    def __init__(
+        self,
+        env: Env,
+        num_envs: int,
+        observation_group: str = "actor",
+        *,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+    ):
+        for what, given, known in (
+            ("observation group", observation_group, tuple(env.observation_layout)),
+            ("autoreset mode", autoreset_mode, (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)),
+            ("render mode", render_mode, _RENDER_MODES),
+        ):
+            if given not in known:
+                raise ConfigError(f"no {what} {given!r}: choose from {', '.join(map(str, known))}")
+        self.env, self.num_envs, self.render_mode, self._group = env, num_envs, render_mode, observation_group
         size = sum(field.size for field in env.observation_layout[observation_group])
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_fps": 1.0 / env.control_period}
-        self._reset = jit(jax.vmap(env.reset), backend=env.backend)
+        self.metadata = {
+            "autoreset_mode": autoreset_mode,
+            "render_modes": ["rgb_array"],
+            "render_fps": 1.0 / env.control_period,
+        }
+        self._same_step = autoreset_mode == AutoresetMode.SAME_STEP
+        self._reset = jit(jax.vmap(lambda seed: env.reset(jax.random.key(seed))), backend=env.backend)
         self._advance = jit(self._step_and_restart, backend=env.backend)
+        self._snapshot = jit(jax.vmap(functools.partial(take_snapshot, env)), backend=env.backend)
         self._state: Any = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         """Observations [num_envs, n] of new episodes, and an empty dictionary.
 
-        `options` has no meaning here. Without a seed the random numbers go on.
+        `seed` is of each environment, or of the first, and one more for each that follows; without one the random
+        numbers go on. `options` has no meaning here.
         """
         del options
-        super().reset(seed=seed)
-        key = jax.random.key(int(self.np_random.integers(2**32)))
-        self._state = self._reset(jax.random.split(key, self.num_envs))
+        if seed is None:
+            seeds = self.np_random.integers(2**32, size=self.num_envs)
+        elif isinstance(seed, (int, np.integer)):
+            super().reset(seed=int(seed))
+            seeds = seed + np.arange(self.num_envs)
+        else:
+            seeds = np.array(seed)
+            super().reset(seed=int(seeds[0]))
+        self._state = self._reset((seeds % 2**32).astype(np.uint32))
         return self._observation(self._state), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control tick of all environments; `actions` [num_envs, A] are clipped to [-1, 1].
 
         Returns:
-          observation [num_envs, n], reward, terminated, truncated [num_envs], and `info`: where an episode ended,
-          `final_obs` [num_envs, n] and `final_info` (return and length) with the masks `_final_obs`, `_final_info`.
+          observation [num_envs, n], reward, terminated, truncated [num_envs], and `info`: empty, but in the mode
+          `SAME_STEP`, where an episode ended, `final_obs` [num_envs, n] and `final_info` (return and length) with the
+          masks `_final_obs`, `_final_info`.
 
         Raises:
           ConfigError: before the first reset.
@@ -77,16 +115,58 @@ class GymVectorEnv(VectorEnv):
         if self._state is None:
             raise ConfigError("reset the environment before its first step")
         self._state, last = self._advance(self._state, np.asarray(actions, np.float32))
-        terminated, truncated = np.array(last.terminated), np.array(last.truncated)
-        done, info = terminated | truncated, dict[str, Any]()
-        if done.any():
+        seen, info = (last if self._same_step else self._state), dict[str, Any]()
+        terminated, truncated = np.array(seen.terminated), np.array(seen.truncated)
+        done = terminated | truncated
+        if self._same_step and done.any():
             ends = {name: np.array(last.metrics[name]) for name in ("return", "length")}
             info = {"final_obs": self._observation(last), "_final_obs": done, "final_info": ends, "_final_info": done}
-        return self._observation(self._state), np.array(last.reward), terminated, truncated, info
+        return self._observation(self._state), np.array(seen.reward), terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Pictures, uint8 [480, 640, 3] each: hand and object, and the forces of the taxels."""
+        if self.render_mode is None:
+            return None
+        snapshots = jax.device_get(self._snapshot(self._state))
+        camera = camera_of(self.env.name, self.env.hand)
+        return tuple(
+            render_frame(self.env.hand, self.env.primitive_kinds, snapshots.map(lambda x, i=i: x[i]), camera=camera)
+            for i in range(self.num_envs)
+        )
 
     def _step_and_restart(self, state: Any, action: jax.Array) -> tuple[Any, Any]:
         last = jax.vmap(self.env.step)(state, action)
-        return jax.vmap(self.env.restart)(last, last.terminated | last.truncated), last
+        ended = last if self._same_step else state
+        return jax.vmap(self.env.restart)(last, ended.terminated | ended.truncated), last
 
     def _observation(self, state: Any) -> np.ndarray:
         return np.array(state.obs[self._group])
+
+
+class GymEnv(gymnasium.Env):
+    """A single environment; arguments as of `GymVectorEnv`."""
+
+    def __init__(self, env: Env, observation_group: str = "actor", *, render_mode: str | None = None):
+        self._batch = GymVectorEnv(
+            env, 1, observation_group, autoreset_mode=AutoresetMode.NEXT_STEP, render_mode=render_mode
+        )
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+        self.metadata, self.render_mode = self._batch.metadata, render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """The observation [n] of a new episode, and an empty dictionary."""
+        super().reset(seed=seed)
+        first = int(self.np_random.integers(2**32)) if seed is None else seed
+        observation, info = self._batch.reset(seed=first)
+        return observation[0], info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One control tick; `action` [A] is clipped to [-1, 1]."""
+        observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> np.ndarray | None:
+        """A picture, uint8 [480, 640, 3]."""
+        pictures = self._batch.render()
+        return pictures[0] if pictures else None

@@ -21,7 +21,7 @@ from dexsim import load_hand
 from dexsim.calibration.maps import save_calibration
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments

@@ -11,7 +11,7 @@ import numpy as np
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.person import Operator
 from dexsim_real.control.motors_off import UNCONFIRMED

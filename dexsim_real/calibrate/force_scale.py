@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation
 
 from dexsim.calibration.sensor import TaxelPress, fit_finger
 from dexsim.core.errors import CalibrationError
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.calibrate.read import Recording, Source
 from dexsim_real.sensors.taxels import around
 

@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.calibration.maps import Calibration, joint_torque, load_calibration
 from dexsim.core import cli
 from dexsim.core.errors import DexsimError
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.identification.excitation import Excitation, excitation
 from dexsim.identification.identify import Identification, identify
 from dexsim.identification.joint import JointLog

@@ -13,7 +13,8 @@ import dataclasses
 import numpy as np
 
 from dexsim.calibration.press import lever_arms
-from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import flexion_joints
 from dexsim_real.control.alarms import finger_joints
 from dexsim_real.core.errors import HandError
 

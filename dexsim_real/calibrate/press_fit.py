@@ -26,7 +26,8 @@ from dexsim.calibration.joint import MIN_SAMPLES, JointPress
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.calibration.press import MIN_LEVER
 from dexsim.core.errors import CalibrationError
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real.calibrate.force_scale import ForceScale, active_taxels, dead_taxels, fill_dead, force_scale
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, TOUCHED, UNLOADING
 from dexsim_real.calibrate.read import Recording, Source

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dexsim.core.config import from_dict
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.calibrate.procedure import RELEASED, REST
 from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig

@@ -6,7 +6,8 @@ public, so every bit counts unless it is listed as harmless. Each finding is one
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand, finger_bodies
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import finger_bodies
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from dexsim.control import move_target, observed_action
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
 from dexsim.task_spec import correct_readings
 from dexsim_ppo.policy import Policy

@@ -10,7 +10,7 @@ from collections import deque
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 
 UNKNOWN = "the pose is not known: the last readings disagree, or are too few"
 _BEYOND = 0.1  # rad beyond a joint's limits up to which an angle is plausible

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck

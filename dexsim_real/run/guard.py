@@ -23,7 +23,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.control.motors_off import UNCONFIRMED, turn_off
 from dexsim_real.core.errors import HandError

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.calibration.maps import Calibration, current_from_counts, normalised_torque
 from dexsim.core.config import Config, setting
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.taxels import StuckTaxels, ZeroTracker, judge_rest, taxel_names
 from dexsim_real.wire import frames

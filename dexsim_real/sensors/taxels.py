@@ -6,7 +6,7 @@ to nothing is stuck, and one that stays near its zero beside neighbours that do 
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 
 _HIGH = 40.0  # counts above which a taxel cannot be tared: alone it is stuck, several adjacent ones touch something

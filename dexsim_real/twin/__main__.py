@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dexsim.calibration.maps import save_calibration
 from dexsim.core import cli
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.process import use_realtime
 from dexsim_real.twin.options import TwinArguments

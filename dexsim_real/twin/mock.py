@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.wire.driver import WITHOUT, DriverState, JointTargets
 from dexsim_real.wire.frames import Mode, command_block, passive_command

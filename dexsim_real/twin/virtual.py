@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.calibration.maps import Calibration, Side
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig

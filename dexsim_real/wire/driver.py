@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire.frames import HOST, Command, Frame, Mode, driver_block, palm_address, passive_command
 from dexsim_real.wire.link import LinkConfig, LinkCounts, Refusal, Reply

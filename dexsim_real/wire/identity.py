@@ -8,7 +8,7 @@ what the emulated hand sends: the register's number in two bytes, low byte first
 import dataclasses
 
 from dexsim.calibration.maps import Calibration
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 
 SIDE, SERIAL_NUMBER = 20, 21

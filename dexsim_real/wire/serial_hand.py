@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.install import install_line
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
 from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames

@@ -1,5 +1,9 @@
-"""A policy as an ONNX model, and its own file without JAX: both act as the policy does."""
+"""A policy as an ONNX model, in a bundle, and its own file without JAX: all act as the policy does."""
 
+import hashlib
+import json
+import re
+import shutil
 import subprocess
 import sys
 
@@ -7,6 +11,11 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from dexsim.calibration.maps import load_calibration
+from dexsim.control import move_target
+from dexsim.errors import CalibrationError, ConfigError, DexsimError
+from dexsim.hand.load import load_hand
+from dexsim.observation import FIELDS
 from dexsim_ppo import export, load_policy
 from dexsim_ppo.portable import PortablePolicy
 
@@ -73,3 +82,67 @@ np.save("action.npy", policy.act(policy.initial_carry(1000), np.load("obs.npy"))
     assert done.returncode == 0, done.stderr
     expected = policy.act(policy.initial_carry(1000), obs)[1]
     assert np.abs(np.load(tmp_path / "action.npy") - np.asarray(expected)).max() < 1e-5
+
+
+@pytest.mark.parametrize(("name", "form"), [("grasp", "bundle"), ("rotate", "bundle.zip")])  # without and with memory
+def test_the_code_of_a_bundle_acts_as_the_policy_where_neither_jax_nor_this_library_is(name, form, tmp_path):
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    policy, bundle = load_policy(name), tmp_path / "bundle"
+    assert export.main([name, "--bundle", str(tmp_path / form)]) == 0
+    if form.endswith(".zip"):
+        shutil.unpack_archive(tmp_path / form, bundle)
+    files = {"README.md", "SHA256SUMS", "calibration.toml", "config.json", "policy.onnx"}
+    assert {path.name for path in bundle.iterdir()} == files and {path.name for path in tmp_path.iterdir()} <= {
+        "bundle",
+        "bundle.zip",
+    }
+    for line in (bundle / "SHA256SUMS").read_text().splitlines():
+        digest, file = line.split("  ")
+        assert hashlib.sha256((bundle / file).read_bytes()).hexdigest() == digest and files.discard(file) is None
+    assert files == {"SHA256SUMS"}
+    with pytest.raises(CalibrationError):
+        load_calibration(bundle / "calibration.toml", load_hand())
+    obs = observations(policy, 60)
+    np.save(bundle / "observations.npy", obs)
+    (code,) = re.findall(r"```python\n(.*?)```", (bundle / "README.md").read_text(), re.DOTALL)
+    head = "import sys\nfor name in ('jax', 'mujoco', 'scipy', 'dexsim', 'dexsim_ppo'):\n    sys.modules[name] = None\n"
+    run = """
+actions, targets, target = [], [], (lower + upper) / 2
+for observation in np.load("observations.npy"):
+    action, carry = act(observation, carry)
+    target = move(target, action, observation[:12])
+    actions.append(action), targets.append(target)
+np.savez("found.npz", action=actions, target=targets)
+"""
+    done = subprocess.run([sys.executable, "-c", head + code + run], cwd=bundle, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found, hand, carry = np.load(bundle / "found.npz"), load_hand(), policy.initial_carry()
+    target = (hand.joint_lower + hand.joint_upper) / 2
+    for observation, action, moved in zip(obs, found["action"], found["target"], strict=True):
+        carry, expected = policy.act(carry, observation)
+        np.testing.assert_allclose(action, expected, atol=2e-5)
+        target = move_target(policy.spec.control, hand, target, expected, observation[:12])
+        np.testing.assert_allclose(moved, target, atol=1e-4)
+    config = json.loads((bundle / "config.json").read_text())
+    assert [tuple(field[key] for key in ("name", "size")) for field in config["observation"]] == [
+        entry[:2] for entry in policy.observation_layout
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ([], ConfigError, "give --output FILE or --bundle FOLDER_OR_ZIP"),
+        (["--bundle", "taken"], DexsimError, "taken: exists already"),
+    ],
+)
+def test_a_bundle_that_cannot_be_written_is_one_line(arguments, error, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(error, match=message):
+        export.main(["grasp", *arguments])
+
+
+def test_every_field_that_an_actor_may_observe_has_a_unit():
+    assert set(export._UNITS) == {field.name for field in FIELDS.values() if field.source != "simulator"}

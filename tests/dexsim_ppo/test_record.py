@@ -32,8 +32,11 @@ def compiled(env):
 @pytest.mark.slow
 def test_readings_and_targets_are_those_of_the_episodes(env, compiled):
     policy = load_policy("grasp")
-    found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
+    found, shown = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
+    for one, snapshots in zip(found, shown, strict=True):
+        np.testing.assert_allclose(snapshots.taxel_force, one.taxel_force)
+        assert snapshots.primitive_active.shape == (10, len(env.primitive_kinds))
     (state, step), memory = compiled, policy.initial_carry(3)
     for tick in range(10):
         for i, one in enumerate(found):
@@ -50,13 +53,13 @@ def test_an_episode_ends_with_its_drop(env):
     policy = load_policy("grasp")
     still = jax.tree.map(np.zeros_like, policy.params.layers)
     idle = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=still))
-    lengths = [len(one.time) for one in record.record(idle, env, episodes=3, seconds=4.0, seed=0)]
+    lengths = [len(one.time) for one in record.record(idle, env, episodes=3, seconds=4.0, seed=0)[0]]
     assert max(lengths) < round(4.0 / env.control_period), "a hand that does nothing drops the object"
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
     monkeypatch.setattr(record, "record", lambda *_, **__: pytest.fail("it went on"))
-    with pytest.raises(ConfigError, match="--lerobot FOLDER or --rrd FILE"):
+    with pytest.raises(ConfigError, match="give --lerobot FOLDER, --rrd FILE or --npz FILE"):
         record.main(["grasp"])
     (tmp_path / "folder").mkdir()
     with pytest.raises(DexsimError, match="folder: exists already"):

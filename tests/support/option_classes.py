@@ -13,4 +13,5 @@ OPTIONS = {
     "dexsim.check_hand": ("dexsim.check_hand:CheckHandArguments", ["leap_like"]),
     "dexsim.hand.mirror": ("dexsim.hand.mirror:MirrorHandArguments", ["leap_like", "--out", "x"]),
     "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
+    "dexsim.view.demo": ("dexsim.view.demo:DemoArguments", []),
 }

@@ -4,7 +4,7 @@ import dataclasses
 
 import dexsim
 from dexsim.core.config import setting
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.objects.config import ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp

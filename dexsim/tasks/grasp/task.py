@@ -24,7 +24,8 @@ from dexsim.env.task import GroundTruth, Task
 from dexsim.force_loop import commanded_force, target_force
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward

@@ -7,7 +7,7 @@ from dexsim.control import Control
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig

@@ -21,7 +21,8 @@ from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact

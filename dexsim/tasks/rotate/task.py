@@ -20,7 +20,7 @@ from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
 from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES

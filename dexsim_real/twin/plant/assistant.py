@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import Scene

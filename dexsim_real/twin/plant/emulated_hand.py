@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, clear, find_place, put, start_of, tilted_gravity
 from dexsim_real.twin.plant.drives import PERIOD, Drives

@@ -20,7 +20,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim.hand.kinematics import Hand, finger_bodies
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import finger_bodies
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF

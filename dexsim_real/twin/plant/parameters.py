@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 
 KINDS = ("outside", "inside", "nominal")

@@ -11,7 +11,7 @@ own axes. Imperfections follow: crosstalk, gains, zero errors that wander as the
 import numpy as np
 from scipy import ndimage
 
-from dexsim.hand.kinematics import Hand
+from dexsim.hand.description import Hand
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import TipContact
 from dexsim_real.twin.plant.shapes import ObjectShape

@@ -1,13 +1,18 @@
-"""Trajectories as a LeRobot dataset: what is read back is what went in."""
+"""Trajectories as a LeRobot dataset, and episodes for the live view: what is read back is what went in."""
 
+import dataclasses
+import io
 import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from dexsim.core.errors import DexsimError
+from dexsim.datasets.episodes import Episodes, read_episodes, write_episodes
 from dexsim.datasets.lerobot import FPS, write_lerobot
 from dexsim.datasets.trajectory import Trajectory
+from dexsim.render.snapshot import Snapshot
 
 pyarrow = pytest.importorskip("pyarrow")
 
@@ -47,6 +52,9 @@ def dataset(hand, tmp_path):
 def test_frames_are_read_back_as_they_went_in(hand, dataset):
     folder, written = dataset
     table = pyarrow.parquet.read_table(folder / "data" / "chunk-000" / "file-000.parquet").to_pydict()
+    state = np.array(table["observation.environment_state"], np.float32)
+    pose = np.concatenate([np.concatenate([t.object_position, t.object_quat], -1) for t in written])
+    np.testing.assert_array_equal(state, np.column_stack([pose, np.concatenate([t.command for t in written])]))
     joints = np.concatenate([t.joint_position for t in written])
     np.testing.assert_array_equal(np.array(table["observation.state"], np.float32), joints)
     np.testing.assert_array_equal(np.array(table["action"], np.float32), np.concatenate([t.target for t in written]))
@@ -119,3 +127,99 @@ def test_a_dataset_that_fails_leaves_nothing(hand, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         write_lerobot(tmp_path / "new", hand, "grasp", [trajectory(3)])
     assert not list(tmp_path.iterdir()) and len(names) == 1 and names[0].startswith(".new.")
+
+
+# --- pictures, and LeRobot's own policies ---------------------------------------------------------------
+
+
+def pictures(ticks):
+    """Flat pictures [T], each a little brighter than the one before."""
+    files = []
+    for t in range(ticks):
+        file = io.BytesIO()
+        Image.fromarray(np.full((24, 32, 3), (t, 2 * t, 255), np.uint8)).save(file, "PNG")
+        files.append(file.getvalue())
+    return np.array(files, object)
+
+
+@pytest.fixture
+def filmed(hand, tmp_path):
+    pytest.importorskip("pandas")
+    written = dataclasses.replace(trajectory(31, period=1 / FPS), picture=pictures(31))
+    return write_lerobot(tmp_path / "filmed", hand, "grasp", [written])
+
+
+def test_pictures_are_read_back_with_their_shape_and_statistics(filmed):
+    info, stats = (json.loads((filmed / "meta" / f"{name}.json").read_text()) for name in ("info", "stats"))
+    name = "observation.images.scene"
+    assert info["features"][name] == {"dtype": "image", "shape": [24, 32, 3], "names": ["height", "width", "channels"]}
+    table = pyarrow.parquet.read_table(filmed / "data" / "chunk-000" / "file-000.parquet")
+    for t, row in enumerate(table[name].to_pylist()):
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(row["bytes"])))[5, 7], (t, 2 * t, 255))
+    np.testing.assert_allclose(stats[name]["max"], np.reshape([30, 60, 255], (3, 1, 1)) / 255)
+    assert np.shape(stats[name]["mean"]) == (3, 1, 1) and stats[name]["count"] == [20]
+
+
+def test_act_and_diffusion_of_lerobot_accept_the_features(filmed):
+    """By LeRobot's own rules its policies can be configured with the object's state, and with pictures."""
+    pytest.importorskip("lerobot")
+    from lerobot.configs.types import FeatureType
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.utils import dataset_to_policy_features
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+
+    data = LeRobotDataset("local/filmed", root=filmed)
+    features = dataset_to_policy_features(data.meta.features)
+    outputs = {name: feature for name, feature in features.items() if feature.type is FeatureType.ACTION}
+    inputs = {name: feature for name, feature in features.items() if name not in outputs}
+    state = {name: inputs[name] for name in ("observation.state", "observation.environment_state")}
+    for config in (ACTConfig, DiffusionConfig):
+        for given in (inputs, state):
+            made = config(input_features=given, output_features=outputs, device="cpu")
+            made.validate_features()
+            assert made.env_state_feature.shape == (8,) and made.robot_state_feature.shape == (12,)
+            assert made.action_feature.shape == (12,) and len(made.image_features) == (given is inputs)
+    frame = data[3]
+    assert tuple(frame["observation.images.scene"].shape) == (3, 24, 32) and len(frame["action"]) == 12
+
+
+# --- episodes for the live view -------------------------------------------------------------------------
+
+
+def test_episodes_are_read_back_to_the_precision_of_their_format(hand, tmp_path):
+    rng = np.random.default_rng(0)
+
+    def shown(ticks):
+        eye = np.broadcast_to(np.eye(3), (ticks, 2, 3, 3))
+        return Snapshot(
+            joint_position=rng.uniform(-1, 1, (ticks, 12)),
+            object_position=rng.uniform(0, 0.1, (ticks, 3)),
+            object_rotation=eye[:, 0],
+            primitive_size=rng.uniform(0, 0.1, (ticks, 2, 3)),
+            primitive_position=np.zeros((ticks, 2, 3)),
+            primitive_rotation=eye,
+            primitive_active=np.ones((ticks, 2), bool),
+            taxel_force=rng.uniform(0, 1, (ticks, 5, 120)),
+            command=rng.random(ticks),
+            target_force=np.full(ticks, np.nan),
+            finger_force=rng.random((ticks, 5)),
+            turns=np.arange(ticks, dtype=np.int32),
+        )
+
+    written = [shown(4), shown(7)]
+    kinds = ("box", "sphere")
+    write_episodes(tmp_path / "a.npz", Episodes(task="t", hand=hand, period=0.03, kinds=kinds, snapshots=written))
+    found = read_episodes(tmp_path / "a.npz")
+    assert (found.task, found.hand.name, found.period, found.kinds) == ("t", hand.name, 0.03, kinds)
+    for now, before in zip(found.snapshots, written, strict=True):
+        for field in dataclasses.fields(Snapshot):
+            new, old = getattr(now, field.name), getattr(before, field.name)
+            assert (new is None) == (old is None)
+            if old is not None:
+                np.testing.assert_allclose(new, old, rtol=5e-4, atol=1e-7)
+    (tmp_path / "b.npz").write_bytes(b"PK")
+    np.savez(tmp_path / "c.npz", qpos=np.zeros(3))
+    for name in ("b.npz", "c.npz"):
+        with pytest.raises(DexsimError, match=f"{name}: no recorded episodes"):
+            read_episodes(tmp_path / name)

@@ -16,8 +16,9 @@ from dexsim.core.errors import AssetError
 from dexsim.geometry import rotations
 from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR, QUAT
 from dexsim.hand import mirror
+from dexsim.hand.description import Hand
 from dexsim.hand.files import find_hand
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.mirror import is_mirror_image, main, mirror_hand, mirror_mjcf, swap_sides, write_mirror
 from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, Readings, mirror_readings, observe

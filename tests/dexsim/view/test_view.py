@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import dexsim
+from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
-from dexsim.render.picture import Pose
+from dexsim.render.picture import Pose, hand_poses
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
@@ -184,21 +185,77 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
     assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
 
 
-def test_view_names_the_missing_extra_before_it_imports_jax():
-    """What takes seconds comes after it: neither JAX nor MuJoCo is imported by then."""
-    code = """
+# Everything that the base install leaves out is absent.
+WITHOUT_JAX = """
 import sys
-sys.modules["viser"] = None
+for name in ("jax", "jaxlib", "mujoco.mjx", "scipy", "matplotlib", "onnx"):
+    sys.modules[name] = None
+sys.argv = ["dexsim"]
+"""
+
+
+def python_without_jax(code):
+    done = subprocess.run([sys.executable, "-c", WITHOUT_JAX + code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_the_demo_shows_recorded_episodes_without_jax():
+    """Each episode to its end, in a scene on viser's server, as the page gets it."""
+    recorded = sorted(path.stem for path in asset_path("episodes").glob("*.npz"))
+    said = python_without_jax(f"""
+import importlib.util
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *rest: None if name == "jax" else find(name, *rest)
+from dexsim.view import demo, viewer
+class Page(viewer.Viewer):
+    def run(self):
+        ticks = sum(len(episode.seconds) for episode in self.source._episodes.snapshots)
+        frames = [self.source.reset({{}}), *(self.source.step({{}}) for _ in range(ticks - 1))]
+        for frame in frames[::100]:
+            self._read_out_at = 0.0
+            self._show(frame)
+        touching = sum(frame.snapshot.taxel_force.max() > 0.05 for frame in frames) / len(frames)
+        print(self.source.camera, len(frames), touching > 0.5, "jax" in sys.modules and sys.modules["jax"])
+        self.server.stop()
+viewer.Viewer = Page
+for name in {recorded}:
+    demo.main([name, "--port", "18090"])
+""")
+    shown = [line.split() for line in said if line.startswith(("grasp ", "rotate "))]
+    assert len(shown) == len(recorded) >= 3
+    for camera, frames, touching, jax in shown:
+        assert camera in ("grasp", "rotate") and int(frames) > 200 and (touching, jax) == ("True", "None")
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ('main(["train"])', "dexsim train needs jax: pip install -e '.[train]'"),
+        ('main(["view", "grasp"])', "showing grasp needs jax: pip install -e '.[train]'"),
+        ("import dexsim; dexsim.make", "dexsim.make needs jax: pip install -e '.[train]'"),
+        ("import dexsim_ppo; dexsim_ppo.load_policy", "dexsim_ppo.load_policy needs jax: pip install -e '.[train]'"),
+        ('main(["demo", "juggle"])', "juggle: no shipped policy of that name: choose from grasp, rotate"),
+    ],
+)
+def test_what_the_base_install_cannot_do_names_the_extra(code, message):
+    (said,) = python_without_jax(f"""
 from dexsim.__main__ import main
 try:
-    main(["view", "grasp"])
+    {code}
 except Exception as error:
     print(error)
-print(sorted({"jax", "mujoco"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    said, imported = done.stdout.splitlines()
-    assert "pip install -e '.[view]'" in said and imported == "[]", done.stderr
+""")
+    assert said.startswith(message)
+
+
+def test_poses_for_pictures_are_those_of_the_kinematics(hand):
+    joints = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (4, hand.num_joints))
+    for angles, drawn in zip(joints, hand_poses(hand, joints), strict=True):
+        links = forward_kinematics(hand, angles.astype(np.float32))
+        expected = links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links)
+        for found, wanted in zip(drawn, expected, strict=True):
+            np.testing.assert_allclose(found, wanted, atol=2e-6)
 
 
 # --- the page -------------------------------------------------------------------------------------------

@@ -1,21 +1,35 @@
-"""The Gymnasium vector environment: the same episodes as ours, with its conventions at their ends."""
+"""The Gymnasium environments: the same episodes as ours, with Gymnasium's conventions at their ends."""
 
 import jax
 import numpy as np
 import pytest
-from tiny_env import TinyEnv
+from simple_physics import SimplePhysics
+from tiny_env import TinyConfig, TinyEnv
 
 pytest.importorskip("gymnasium")
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import dexsim
 from dexsim.errors import ConfigError
-from dexsim.wrappers.gymnasium import GymVectorEnv
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.wrappers.gymnasium import GymEnv, GymVectorEnv
+
+NEXT_STEP = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+        yield dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
 
 
 def test_it_steps_as_the_environment_does():
     ours, env = TinyEnv(), GymVectorEnv(TinyEnv(), 4)
     seen, info = env.reset(seed=3)
     assert info == {} and env.observation_space.contains(seen) and seen.dtype == np.float32
-    key = jax.random.key(int(np.random.default_rng(3).integers(2**32)))
-    state = jax.vmap(ours.reset)(jax.random.split(key, 4))
+    state = jax.vmap(lambda seed: ours.reset(jax.random.key(seed)))(np.arange(3, 7))
     np.testing.assert_array_equal(seen, state.obs["actor"])
     env.action_space.seed(0)
     for _ in range(5):
@@ -46,15 +60,79 @@ def test_a_finished_episode_restarts_in_the_same_step_and_leaves_its_last_observ
     np.testing.assert_allclose(info["final_info"]["return"][done], np.asarray(state.metrics["return"])[done], rtol=1e-6)
 
 
-def test_seeds_repeat_and_without_one_the_numbers_go_on():
-    env = GymVectorEnv(TinyEnv(), 4)
-    first, again = env.reset(seed=5)[0], env.reset(seed=5)[0]
-    np.testing.assert_array_equal(first, again)
-    assert np.any(env.reset()[0] != first)
+def test_a_finished_episode_restarts_in_the_next_step_as_gymnasiums_own_vector_environment_has_it():
+    """Against `SyncVectorEnv` of single environments: the same ends, rewards and, up to the first restart, states."""
+    from gymnasium.vector import SyncVectorEnv
+
+    config = TinyConfig(horizon=6, gain=1.0, wall=1.5)
+    ours = GymVectorEnv(TinyEnv(config), 2, **NEXT_STEP)
+    theirs = SyncVectorEnv([lambda: GymEnv(TinyEnv(config))] * 2)
+    assert theirs.metadata["autoreset_mode"] == ours.metadata["autoreset_mode"]
+    (seen, _), (expected, _) = ours.reset(seed=7), theirs.reset(seed=7)
+    np.testing.assert_allclose(seen, expected, rtol=1e-6)
+    action, ended = np.zeros((2, 1), np.float32), []
+    for _ in range(16):
+        (seen, reward, terminated, truncated, info), other = ours.step(action), theirs.step(action)
+        np.testing.assert_array_equal([terminated, truncated], other[2:4])
+        if not ended:
+            np.testing.assert_allclose(seen, other[0], rtol=1e-6)
+        if ended and ended[-1]:
+            assert (reward == 0).all() and (other[1] == 0).all()
+            np.testing.assert_allclose(np.asarray(ours._state.metrics["length"]), 0)
+        assert info == {}
+        ended.append(bool(truncated.all()))
+    assert np.flatnonzero(ended).tolist() == [5, 12], "six steps, and one that restarts"
 
 
-def test_what_does_not_fit_is_one_line():
-    with pytest.raises(ConfigError, match="no observation group .eyes.: choose"):
-        GymVectorEnv(TinyEnv(), 2, "eyes")
+def test_seeds_repeat_are_each_environments_own_and_without_one_the_numbers_go_on():
+    env = GymVectorEnv(TinyEnv(), 3)
+    first = env.reset(seed=5)[0]
+    np.testing.assert_array_equal(first, env.reset(seed=[5, 6, 7])[0])
+    np.testing.assert_array_equal(first[[2, 0, 1]], env.reset(seed=(7, 5, 6))[0])
+    after = env.reset(seed=[5, 6, 7])[0], env.reset()[0]
+    assert np.any(after[1] != after[0])
+    single = GymEnv(TinyEnv())
+    np.testing.assert_array_equal(single.reset(seed=5)[0], first[0])
+
+
+def test_gymnasiums_checker_accepts_a_single_environment(grasp):
+    env = GymEnv(grasp, render_mode="rgb_array")
+    with pytest.warns(UserWarning, match="infinity|spec"):  # of the bounds of an observation in SI units
+        check_env(env)
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (480, 640, 3) and picture.dtype == np.uint8 and len(np.unique(picture)) > 50
+
+
+def test_a_batch_is_drawn_as_one_picture_each(grasp):
+    env = GymVectorEnv(grasp, 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    first, second = env.render()
+    assert first.shape == second.shape == (480, 640, 3) and np.any(first != second)
+    assert GymEnv(grasp).render() is None
+
+
+def test_a_learner_in_the_manner_of_cleanrl_learns_through_gymnasiums_wrappers():
+    pytest.importorskip("flax")
+    from cleanrl_ppo import train
+
+    returns = train(GymVectorEnv(TinyEnv(), 32, **NEXT_STEP), iterations=25)
+    assert returns[:64].mean() < 20 < 28 < returns[-64:].mean(), "of 31.2 at best"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"observation_group": "eyes"}, "no observation group .eyes.: choose from actor"),
+        ({"autoreset_mode": AutoresetMode.DISABLED}, "no autoreset mode .*: choose from .*SAME_STEP"),
+        ({"render_mode": "human"}, "no render mode .human.: choose from None, rgb_array"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        GymVectorEnv(TinyEnv(), 2, **arguments)
+
+
+def test_a_step_before_the_first_reset_is_an_error():
     with pytest.raises(ConfigError, match="reset the environment before"):
         GymVectorEnv(TinyEnv(), 1).step(np.zeros((1, 1)))

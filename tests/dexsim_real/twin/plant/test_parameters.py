@@ -143,7 +143,7 @@ def test_the_physics_shares_no_code_with_training():
     paths = sorted(folder.rglob("*.py"))
     ours = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths}
     assert "dexsim_real.twin.plant.emulated_hand" in ours and len(ours) > 9
-    kinematics = ("dexsim.hand.kinematics.Hand", "dexsim.hand.kinematics.finger_bodies")
+    kinematics = ("dexsim.hand.description.Hand", "dexsim.hand.kinematics.finger_bodies")
     bridge = {"dexsim_real.wire.frames", "dexsim_real.core.errors", *ours}
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
