@@ -67,7 +67,7 @@ __getattr__, __dir__ = lazy_exports(
         "GraspConfig": "dexsim.tasks.grasp.config",
         "GraspReward": "dexsim.tasks.grasp.config",
         "GroundTruth": "dexsim.env.task",
-        "Hand": "dexsim.hand.kinematics",
+        "Hand": "dexsim.hand.description",
         "ObjectConfig": "dexsim.objects.config",
         "Readings": "dexsim.observation",
         "RotateConfig": "dexsim.tasks.rotate.config",
