@@ -51,7 +51,7 @@ class Surface(NamedTuple):
     """What each ray of a view sees first. Depth runs along the optical axis."""
 
     depth: np.ndarray  # [H, W] m, 1e6 where empty
-    index: np.ndarray  # [H, W] int, primitive, -1 where empty
+    primitive: np.ndarray  # [H, W] int, -1 where empty
     normal: np.ndarray  # [H, W, 3] unit, outward
 
 
@@ -96,7 +96,7 @@ def draw_scene(
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
 
     links = cast(body, view, rays)
-    _paint(color, body, links, links.index >= 0, rays, view, camera)
+    _paint(color, body, links, links.primitive >= 0, rays, view, camera)
     _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view)
     front = cast(held, view, rays)
     _paint(color, held, front, front.depth < links.depth, rays, view, camera, _OBJECT_OPACITY)
@@ -182,7 +182,7 @@ def _paint(
 ) -> None:
     """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the picture,
     linear RGB [H, W, 3]."""
-    index, normal = surface.index[seen], surface.normal[seen]
+    index, normal = surface.primitive[seen], surface.normal[seen]
     up = unit(np.asarray(camera.up, float))
     light = unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])  # over the camera's right shoulder
     away = (1 - np.clip(-np.sum(normal * unit(rays[seen]), -1), 0, 1))[:, None]

@@ -28,23 +28,6 @@ def test_damping_acts_at_the_mean_speed_of_the_step(step):
     np.testing.assert_allclose(INERTIA * (after - v), step * pd(0, q, (v + after) / 2), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.05, 0.3])
-def test_the_bound_is_where_one_joint_begins_to_chatter(damping):
-    """h^2 k_p / I < 4 whatever the motor's damping, of a joint that is stepped as engines do."""
-
-    def grows(step):
-        q, v = 0.01, 0.0
-        for _ in range(20_000):
-            v += step * (-STIFFNESS * q - damping * v) / (INERTIA + step * damping / 2)
-            q += step * v
-            if abs(q) > 1.0:
-                return True
-        return False
-
-    bound = 2 * np.sqrt(INERTIA / STIFFNESS)
-    assert not grows(0.995 * bound) and grows(1.005 * bound)
-
-
 def test_the_default_step_is_stable_and_stiff_motors_are_refused_with_what_to_do(hand):
     ranges = Randomization()
     check_timestep(hand, PhysicsConfig(), ranges)

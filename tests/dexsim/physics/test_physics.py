@@ -10,7 +10,6 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.model import build_scene
 from dexsim.physics.physics import Physics, choose_backend
 
 GRAVITY = (9.81, 0.0, 0.0)
@@ -50,14 +49,6 @@ def test_backends(monkeypatch):
 def test_configurations_that_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         PhysicsConfig(**changes)
-
-
-@pytest.mark.parametrize(("backend", "converged"), [("c", 20), ("cuda", 10), ("mjx", 10)])
-def test_iterations_and_tolerance_are_the_solvers(hand, backend, converged):
-    for iterations, expected in ((0, converged), (3, 3), (30, 30)):
-        config = PhysicsConfig(iterations=iterations, tolerance=1e-6)
-        option = build_scene(hand, SLOTS, ObjectConfig().largest, config, GRAVITY, backend).model.opt
-        assert (option.iterations, option.tolerance) == (expected, 1e-6)
 
 
 def test_a_model_without_named_contact_geoms(hand, tmp_path):

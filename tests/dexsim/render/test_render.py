@@ -1,6 +1,7 @@
 """The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 import warnings
@@ -71,7 +72,7 @@ def test_rays_hit_the_surface_with_outward_normals(kind):
     view = look(Camera(azimuth=40, elevation=30, distance=0.3), (120, 120))
     rays = view.rays()
     surface = cast(primitives((kind, size, place))._replace(rotation=turn[None]), view, rays)
-    seen = surface.index == 0
+    seen = surface.primitive == 0
     assert seen.sum() > 300 and np.all(surface.depth[~seen] == 1e6)
     points = view.origin + surface.depth[seen][:, None] * rays[seen]
     shape = sdf.Shape((kind,), size[None], place[None], np.float32(turn)[None], np.ones(1, bool))
@@ -91,14 +92,14 @@ def test_a_sphere_projects_where_the_pinhole_formula_says_and_hides_what_is_behi
     centre, radius = np.array([0.03, -0.02, 0.05]), 0.02
     scene = primitives(("box", [0.1, 0.1, 0.01], [0, 0, 0]), ("sphere", [radius, 0, 0], centre))
     surface = cast(scene, view, view.rays())
-    rows, columns = np.nonzero(surface.index == 1)
+    rows, columns = np.nonzero(surface.primitive == 1)
     focal, distance = 100 / np.tan(np.deg2rad(20)), 0.5 - 0.05
     expected = 150 + focal * centre[1] / distance, 100 + focal * centre[0] / distance
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], expected, atol=0.7)
     seen_radius = focal * radius / np.sqrt(distance**2 - radius**2)
     np.testing.assert_allclose(np.sqrt(len(rows) / np.pi), seen_radius, rtol=0.02)
     np.testing.assert_allclose(surface.depth.min(), distance - radius, rtol=1e-3)
-    assert surface.index[100, 200] == 0  # beside the sphere, on the box
+    assert surface.primitive[100, 200] == 0  # beside the sphere, on the box
 
 
 def test_more_force_is_hotter():
@@ -230,13 +231,23 @@ def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
 
 
 def test_rendering_needs_no_opengl_and_no_pyplot():
-    code = (
-        "import sys, dexsim.render.render as r; assert not {'matplotlib', 'PIL'} & set(sys.modules);"
-        "import numpy as np; from dexsim.render.panel import force_color; force_color(np.ones(1), 1.0);"
-        "bad = {'OpenGL', 'glfw', 'matplotlib.pyplot', 'pyglet', 'mujoco.egl', 'imageio_ffmpeg'} & set(sys.modules);"
-        "assert not bad, bad"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    code = """
+import sys
+import numpy as np
+import dexsim.render.render
+from dexsim.render.camera import Camera, look
+from dexsim.render.picture import Primitives, cast
+assert not {"matplotlib", "PIL"} & set(sys.modules)
+ball = Primitives(("sphere",), np.full((1, 3), 0.1), np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
+view = look(Camera(), (8, 8))
+assert (cast(ball, view, view.rays()).primitive == 0).any()
+from dexsim.render.panel import force_color
+force_color(np.ones(1), 1.0)
+bad = {"OpenGL", "glfw", "matplotlib.pyplot", "pyglet", "mujoco.egl", "imageio_ffmpeg"} & set(sys.modules)
+assert not bad, bad
+"""
+    environment = os.environ | {"MUJOCO_GL": "disabled"}  # MuJoCo loads what draws by OpenGL unless told otherwise
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env=environment)
 
 
 def test_a_film_that_fails_leaves_the_one_before_it(hand, tmp_path, monkeypatch):
