@@ -154,7 +154,7 @@ def mirror_taxels(text: str) -> str:
     """
     head, *rows = csv.reader(io.StringIO(text))
     y, normal_y, at = head.index("y"), head.index("ny"), [head.index(name) for name in "xyz"]
-    mirrored = []
+    mirrored: list[list[str]] = []
     for _, group in groupby(rows, key=lambda row: row[head.index("finger")]):
         taxels = list(group)
         place = np.array([[float(row[i]) for i in at] for row in taxels])
