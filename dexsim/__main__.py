@@ -26,6 +26,7 @@ COMMANDS = {
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
     "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
+    "import-hand": ("dexsim.import_hand", "make a hand's folder from a URDF or MJCF"),
 }
 """Module and purpose of each command."""
 
