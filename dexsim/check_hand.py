@@ -96,7 +96,7 @@ def check_frame(hand: Hand) -> None:
     if aside * side < -_SIDEWAYS:
         raise AssetError(
             f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {'-' if side > 0 else '+'}y, "
-            f"expected {'+' if side > 0 else '-'}y: turn the palm frame, or put left in a left hand's name, and only there"
+            f"expected {'+' if side > 0 else '-'}y: turn the palm frame; the name of a left hand, and no other, says left"
         )
 
 
@@ -122,8 +122,8 @@ def check_signs(hand: Hand) -> None:
                 wrong.append(hand.joint_names[joint])
     if wrong:
         raise AssetError(
-            f"{hand.model_path}: positive angles open {', '.join(wrong)}: they must close the finger, toward the palm's "
-            "normal +x; negate the joint's axis and range"
+            f"{hand.model_path}: positive angles open {', '.join(wrong)}: they must close the finger, toward the "
+            "palm's normal +x; negate the joint's axis and range"
         )
 
 
@@ -140,18 +140,16 @@ def check_reach(hand: Hand) -> None:
     if away.min() > _REACH:
         raise AssetError(
             f"{hand.source}: [grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is "
-            f"{1e3 * away.min():.0f} mm from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is in "
-            f"the palm frame"
+            f"{1e3 * away.min():.0f} mm from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is "
+            "in the palm frame"
         )
     centre[0] = palm_height(hand) + 0.005 + _BALL
-    ball = sdf.Shape(
-        ("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool)
-    )  # fmt: skip
+    ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
     gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
     if gap < -_OVERLAP:
         raise AssetError(
-            f"{hand.source}: [grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm "
-            "that lies at centre: open the posture or move centre"
+            f"{hand.source}: [grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of "
+            f"{2e3 * _BALL:.0f} mm that lies at centre: open the posture or move centre"
         )
 
 
@@ -168,8 +166,8 @@ def check_limits(hand: Hand) -> None:
         odd = np.flatnonzero((values < low) | (values > high))
         if odd.size:
             raise AssetError(
-                f"{hand.source}: joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, expected "
-                f"{low:g} to {high:g} {unit} ({odd.size} joints)"
+                f"{hand.source}: joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
+                f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
             )
 
 

@@ -94,8 +94,8 @@ def _mjcf(sheet: HandSheet) -> mujoco.MjSpec:
             body.add_geom(name="palm_box", type=kinds.mjGEOM_BOX, pos=centre, size=half, rgba=_TOUCH, group=3)
             # The palm's face as a half-space, for objects that boxes do not meet in closed form.
             body.add_geom(
-                name="palm_face", type=kinds.mjGEOM_PLANE, pos=centre + [half[0], 0, 0], quat=[0.5**0.5, 0, 0.5**0.5, 0],
-                size=[half[2], half[1], 0.001], rgba=[0, 0, 0, 0], group=3,
+                name="palm_face", type=kinds.mjGEOM_PLANE, pos=centre + [half[0], 0, 0],
+                quat=[0.5**0.5, 0, 0.5**0.5, 0], size=[half[2], half[1], 0.001], rgba=[0, 0, 0, 0], group=3,
             )  # fmt: skip
         elif at in sheet.capsules:
             capsule = sheet.capsules[at]

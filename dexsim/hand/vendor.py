@@ -91,8 +91,8 @@ def read_description(
         tendons = [tendon.name for tendon in spec.tendons]
         if tendons and not drop_tendons:
             raise AssetError(
-                f"{path}: tendons {', '.join(tendons)[:60]}: not supported; --drop-tendons gives each of their joints a "
-                "motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another (ratio of their angles)"
+                f"{path}: tendons {', '.join(tendons)[:60]}: not supported; --drop-tendons gives each of their joints "
+                "a motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another (ratio of their angles)"
             )
         if tendons:
             pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
