@@ -96,7 +96,7 @@ def check_frame(hand: Hand) -> None:
     if aside * side < -_SIDEWAYS:
         raise AssetError(
             f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {'-' if side > 0 else '+'}y, "
-            f"expected {'+' if side > 0 else '-'}y: turn the palm frame; the name of a left hand, and no other, says left"
+            f"expected {'+' if side > 0 else '-'}y: turn the palm frame; only a left hand's name says left"
         )
 
 
