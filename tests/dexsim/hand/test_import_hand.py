@@ -158,8 +158,8 @@ MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom t
 {}</body></worldbody>{}</mujoco>"""
 CHAIN = """<body name="{0}" pos="0 {1} 0.05"><joint name="{0}_a" axis="0 1 0" range="0 1.5"/>
 <geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.03"/><body name="{0}b" pos="0 0 0.03">
-<joint name="{0}_b" axis="0 1 0" range="0 1.5"/><geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.025"/></body></body>
-"""
+<joint name="{0}_b" axis="0 1 0" range="0 1.5"/><geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.025"/></body>
+</body>"""
 ACTUATORS = """<actuator><position joint="thumb_a" forcerange="-0.4 0.4"/>
 <motor joint="f_a" ctrlrange="-1 1" gear="0.3"/>
 </actuator>"""
