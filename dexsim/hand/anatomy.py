@@ -67,8 +67,7 @@ def orient(
         )
     first, doubts = _find_thumb(links, chains, thumb)
     others = [chain for index, chain in enumerate(chains) if index != first]
-    rotation, doubt = _find_frame(links, others, along, normal)
-    doubts += doubt
+    rotation = _find_frame(links, others, along, normal)
     links = tuple(_turned(link, rotation) for link in links)
     order = sorted(others, key=lambda chain: np.mean([_joint(links[at]).anchor[1] for at in chain]))
     # From the thumb's side on.
@@ -78,13 +77,19 @@ def orient(
     fingers = [Finger(name="thumb", links=tuple(chains[first]))]
     fingers += [Finger(name=name, links=tuple(chain)) for name, chain in zip(_NAMES, order, strict=False)]
     links, changed = _close_positive(links, fingers)
-    return Anatomy(
+    anatomy = Anatomy(
         description=dataclasses.replace(description, links=links),
         fingers=tuple(fingers),
         rotation=rotation,
         reversed=changed,
         doubts=tuple(doubts),
     )
+    side, other = ("left", "right") if anatomy.left else ("right", "left")
+    names = " ".join([description.name, *(link.name for link in links)]).lower()
+    if other in names and side not in names:
+        doubt = f"the file's names say {other}, the thumb is where a {side} hand has it: check the palm frame"
+        anatomy = dataclasses.replace(anatomy, doubts=(*doubts, doubt))
+    return anatomy
 
 
 def tip_of(links: tuple[Link, ...], chain: tuple[int, ...] | list[int]) -> np.ndarray:
@@ -147,11 +152,11 @@ def _find_thumb(links: tuple[Link, ...], chains: list[list[int]], given: str) ->
 
 def _find_frame(
     links: tuple[Link, ...], fingers: list[list[int]], along: np.ndarray | None, normal: np.ndarray | None
-) -> tuple[np.ndarray, list[str]]:
+) -> np.ndarray:
     """The palm's axes [3, 3] in rows, from the fingers but the thumb."""
     axes = np.array([_joint(links[chain[-1]]).axis for chain in fingers])
     values, vectors = np.linalg.eigh(axes.T @ axes)
-    across, doubts = vectors[:, -1], []
+    across = vectors[:, -1]
     if values[-1] < 0.8 * len(fingers) and (along is None or normal is None):
         raise AssetError(
             "the fingers' last joints are not parallel, so no palm side is found: give --fingers and --normal, axes of "
@@ -177,7 +182,7 @@ def _find_frame(
     rounded = np.round(rotation)
     if along is None and normal is None and np.all(np.abs(rotation[rounded != 0]) > _SNAP) and _is_rotation(rounded):
         rotation = rounded
-    return rotation, doubts
+    return rotation
 
 
 def _is_rotation(matrix: np.ndarray) -> bool:

@@ -81,7 +81,7 @@ def _mjcf(sheet: HandSheet) -> mujoco.MjSpec:
             )
             hinge.limited, hinge.armature = mujoco.mjtLimited.mjLIMITED_TRUE, 0.0002 if joint.leader else 0.001
             if joint.leader:
-                data = np.zeros(11)
+                data = np.zeros(mujoco.mjNEQDATA)
                 data[:2] = joint.offset, joint.ratio
                 spec.add_equality(
                     type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.name,

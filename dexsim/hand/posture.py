@@ -47,8 +47,9 @@ def find_grasp(anatomy: Anatomy, capsules: Mapping[int, Capsule], palm: PalmBox,
     roots = np.array([links[finger.links[0]].joint.anchor for finger in fingers])  # type: ignore[union-attr]
     height = palm.centre[0] + palm.half[0] + BALL + 0.006
     thumb_root = links[thumb.links[0]].joint.anchor  # type: ignore[union-attr]
-    low = np.minimum(roots.min(0), thumb_root)[1:] - [0.0, 0.02]
-    high = np.maximum(roots.max(0), thumb_root)[1:] + [0.0, 0.06]
+    # Over the palm, or a little beyond the fingers' roots.
+    low = np.maximum(np.minimum(roots.min(0), thumb_root)[1:] - [0.0, 0.02], (palm.centre - palm.half)[1:] + BALL / 2)
+    high = np.maximum(np.maximum(roots.max(0), thumb_root)[1:] + [0.0, 0.06], low + _STEP)
     best, best_score = None, -np.inf
     for y, z in itertools.product(np.arange(low[0], high[0] + 1e-9, _STEP), np.arange(low[1], high[1], _STEP)):
         centre = np.array([height, y, z])

@@ -329,7 +329,8 @@ class _Reader:
         if surface is not None:
             surface.apply_translation(-origin)
             surface.apply_transform(np.block([[turn.T, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
-        name = model.body(body).name or f"link_{body}"
+        name = model.body(body).name if body else "palm"
+        name = name or f"link_{body}"
         return Link(
             name=name, parent=parent, joint=joint, mass=mass, centre=centre, inertia=inertia, surface=surface
         )  # fmt: skip
