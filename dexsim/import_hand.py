@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -209,7 +209,7 @@ def make_sheet(
     pads = [capsules[finger.tip_link] for finger in fingers]
     # Six columns over the front two thirds of a pad, eight rows along it.
     across = min(0.0035, min(pad.radius for pad in pads) * np.pi * 2 / 3 / 5)
-    along = min(0.0035, min(np.linalg.norm(pad.ends[1] - pad.ends[0]) + pad.radius for pad in pads) / 7)
+    along = min(0.0035, min(float(np.linalg.norm(pad.ends[1] - pad.ends[0])) + pad.radius for pad in pads) / 7)
     signs = f"signs: {', '.join(anatomy.reversed)} turned round" if anatomy.reversed else "signs: as in the file"
     frame = f"palm frame in that of {links[0].name}: x {_axis(anatomy.rotation[0])}, z {_axis(anatomy.rotation[2])}"
     sheet = HandSheet(
@@ -220,7 +220,7 @@ def make_sheet(
         fingers=tuple(fingers),
         motors=motors,
         taxel_grid=(6, 8),
-        taxel_pitch=(float(across), float(along)),
+        taxel_pitch=(across, along),
         posture={motor: grasp.posture[motor] for motor in motors},
         centre=grasp.centre,
         remarks=(f"Imported from {source} by dexsim import-hand.", frame, signs, *(f"assumed: {a}" for a in assumed)),
@@ -293,7 +293,7 @@ def _with_masses(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], list[str]]:
     return tuple(done), [f"mass by volume: {', '.join(names)}"] if names else []
 
 
-def _box_round(points: np.ndarray):  # type: ignore[no-untyped-def]
+def _box_round(points: np.ndarray) -> Any:
     import trimesh
 
     box = trimesh.creation.box(np.ptp(points, axis=0) + 0.015)

@@ -122,10 +122,10 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repai
     except AssetError as error:
         if repair == "none":
             raise
-        given = vertices, faces
-        vertices, faces = _merge(*(_shell if repair == "shell" else _hull)(*given), _SAME * size)
+        before = vertices, faces
+        vertices, faces = _merge(*(_shell if repair == "shell" else _hull)(*before), _SAME * size)
         _check_closed(f"{name} after repair", vertices, faces, size)
-        print(f"{error}; its {repair} is {1e3 * _deviation(given, (vertices, faces)):.2g} mm away", file=sys.stderr)
+        print(f"{error}; its {repair} is {1e3 * _deviation(before, (vertices, faces)):.2g} mm away", file=sys.stderr)
     return Mesh(name, vertices, faces)
 
 

@@ -5,7 +5,9 @@ palm frame, and no body has a rotation of its own.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -64,7 +66,7 @@ def _mjcf(sheet: HandSheet) -> mujoco.MjSpec:
     spec, kinds = mujoco.MjSpec(), mujoco.mjtGeom
     spec.modelname = sheet.name
     spec.compiler.degree = False
-    bodies = []
+    bodies: list[Any] = []
     tips = {finger.tip_link: finger.name for finger in sheet.fingers}
     for at, link in enumerate(sheet.links):
         joint = link.joint
@@ -144,5 +146,5 @@ def _toml(sheet: HandSheet) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _row(values) -> str:  # type: ignore[no-untyped-def]
+def _row(values: Iterable[Any]) -> str:
     return "[" + ", ".join(f"{round(float(value), 4):g}" for value in values) + "]"

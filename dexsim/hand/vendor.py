@@ -423,12 +423,11 @@ class _Reader:
                     f"{self.path}: --couple {text}: expected FOLLOWER=LEADER:RATIO, joints of {', '.join(names)}"
                 ) from None
         followers = {}
-        for first in direct:
-            leader, ratio, offset = direct[first]
+        for first, (motor, ratio, offset) in direct.items():
             for _ in range(len(direct)):  # a follower of a follower
-                if leader in direct:
-                    above, factor, shift = direct[leader]
-                    leader, ratio, offset = above, ratio * factor, offset + ratio * shift
-            if leader in joints and leader != first:
-                followers[first] = leader, ratio, offset
+                if motor in direct:
+                    above, factor, shift = direct[motor]
+                    motor, ratio, offset = above, ratio * factor, offset + ratio * shift
+            if motor in joints and motor != first:
+                followers[first] = motor, ratio, offset
         return followers

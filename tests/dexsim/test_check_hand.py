@@ -97,7 +97,9 @@ def test_broken_files_are_one_clear_line(name, folder, capsys, monkeypatch):
     path.write_text("\n".join(lines))
     assert check_hand.main([str(folder / "xhand_right.toml")]) == 1
     failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
-    assert len(failed) == 1 and failed[0].startswith(f"FAIL  {check}: ") and re.search(said, failed[0]), failed
+    # Which way a thumb closes is judged by its taxels.
+    count = 2 if name == "normals" else 1
+    assert len(failed) == count and failed[0].startswith(f"FAIL  {check}: ") and re.search(said, failed[0]), failed
 
 
 def test_mesh_that_touches_is_refused(folder, capsys, monkeypatch):
