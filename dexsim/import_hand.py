@@ -23,7 +23,7 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import Anatomy, flexion_links, orient, tip_of
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import FingerSheet, HandSheet, write_hand
-from dexsim.hand.posture import find_grasp
+from dexsim.hand.posture import Grasp, find_grasp
 from dexsim.hand.vendor import Joint, Link, read_description
 
 _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
@@ -169,7 +169,7 @@ def make_sheet(
       gap: m between ball and links in the first grasp.
 
     Raises:
-      AssetError: a finger has no motor, or the palm no shape.
+      AssetError: a finger has no motor.
     """
     links, assumed = _with_limits(anatomy.description.links, torque, speed)
     links, more = _with_masses(links)
@@ -187,23 +187,7 @@ def make_sheet(
         capsules[at] = _pad(anatomy, at, assumed) if at in tips else fit_capsule(link.surface, _along(anatomy, at))
     palm = fit_palm(links[0].surface)
     grasp = find_grasp(anatomy, capsules, palm, gap)
-    fingers = []
-    for finger in anatomy.fingers:
-        flexing = flexion_links(links, finger.links)
-        roots = [j.name for at in (*flexing, *finger.links) if (j := links[at].joint) and not j.leader]
-        if not roots:
-            raise AssetError(f"finger {finger.name!r} ({links[finger.links[-1]].name}) has no motor of its own")
-        last = links[finger.links[-1]].joint
-        assert last is not None
-        facing = np.cross(last.axis, tip_of(links, finger.links) - last.anchor)
-        fingers.append(
-            FingerSheet(
-                name=finger.name,
-                tip_link=finger.links[-1],
-                root_joint=roots[0],
-                facing=facing / np.linalg.norm(facing),
-            )
-        )
+    fingers = _finger_sheets(anatomy)
     order = [at for finger in anatomy.fingers for at in finger.links]
     motors = tuple(dict.fromkeys(j.name for at in order if (j := links[at].joint) and not j.leader))
     pads = [capsules[finger.tip_link] for finger in fingers]
@@ -217,7 +201,7 @@ def make_sheet(
         links=links,
         palm=palm,
         capsules=capsules,
-        fingers=tuple(fingers),
+        fingers=fingers,
         motors=motors,
         taxel_grid=(6, 8),
         taxel_pitch=(across, along),
@@ -225,26 +209,53 @@ def make_sheet(
         centre=grasp.centre,
         remarks=(f"Imported from {source} by dexsim import-hand.", frame, signs, *(f"assumed: {a}" for a in assumed)),
     )
+    return sheet, [*_table(sheet, grasp), *(f"assumed      {text}" for text in assumed)]
+
+
+def _finger_sheets(anatomy: Anatomy) -> tuple[FingerSheet, ...]:
+    """What the TOML says of the fingers.
+
+    Raises:
+      AssetError: one has no motor.
+    """
+    links = anatomy.description.links
+    sheets: list[FingerSheet] = []
+    for finger in anatomy.fingers:
+        chain = (*flexion_links(links, finger.links), *finger.links)
+        roots = [joint.name for at in chain if (joint := links[at].joint) and not joint.leader]
+        last = links[finger.links[-1]]
+        if not roots:
+            raise AssetError(f"finger {finger.name!r} ({last.name}) has no motor of its own")
+        assert last.joint is not None
+        facing = np.cross(last.joint.axis, tip_of(links, finger.links) - last.joint.anchor)
+        facing = facing / np.linalg.norm(facing)
+        sheets.append(FingerSheet(name=finger.name, tip_link=finger.links[-1], root_joint=roots[0], facing=facing))
+    return tuple(sheets)
+
+
+def _table(sheet: HandSheet, grasp: Grasp) -> list[str]:
+    """A line for each link, the palm and the grasp."""
     lines = ["link                    joint                    range [rad]    Nm   rad/s  radius, fit mean, max [mm]"]
-    for at, link in enumerate(links):
-        joint, capsule = link.joint, capsules.get(at)
+    for at, link in enumerate(sheet.links):
+        joint, capsule = link.joint, sheet.capsules.get(at)
         text = f"{link.name[:22]:23} "
         if joint is not None:
             text += f"{joint.name[:22]:23} {joint.low:6.2f} {joint.high:5.2f} "
-            text += f"{joint.torque:6.2f} {joint.speed:6.1f}" if not joint.leader else f" = {joint.leader[:12]:10}"
+            text += f"{joint.torque:6.2f} {joint.speed:6.1f}" if not joint.leader else f" = {joint.leader[:10]:10}"
         if capsule:
             fit = tuple(1e3 * x for x in (capsule.radius, capsule.mean_error, capsule.largest_error))
             text += f"  {fit[0]:5.1f} {fit[1]:6.1f} {fit[2]:5.1f}"
         lines.append(text)
-    face = palm.centre[0] + palm.half[0]
+    sides, face = " x ".join(f"{2e3 * x:.0f}" for x in sheet.palm.half), sheet.palm.centre[0] + sheet.palm.half[0]
+    beyond = 1e3 * sheet.palm.largest_error
     lines.append(
-        f"palm         box of {' x '.join(f'{2e3 * x:.0f}' for x in palm.half)} mm, face at x = {1e3 * face:.0f} mm"
+        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond:.0f} mm beyond it"
     )
     lines.append(
         f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in grasp.centre)} mm, {grasp.reaching} of "
-        f"{len(fingers)} fingertips near it, the farthest {1e3 * grasp.farthest:.0f} mm away"
+        f"{len(sheet.fingers)} fingertips near it, the farthest {1e3 * grasp.farthest:.0f} mm away"
     )
-    return sheet, lines + [f"assumed      {text}" for text in assumed]
+    return lines
 
 
 def _with_limits(links: tuple[Link, ...], torque: float, speed: float) -> tuple[tuple[Link, ...], list[str]]:
