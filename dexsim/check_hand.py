@@ -75,8 +75,7 @@ def check_fingertips(hand: Hand) -> None:
 
 
 def check_frame(hand: Hand) -> None:
-    """With the joints at 0, fingers point along +z, and the thumb is on the side of +y (of -y if "left" is in the
-    hand's name).
+    """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of -y.
 
     Raises:
       AssetError: a finger points elsewhere, or the thumb is on the other side.
@@ -92,11 +91,11 @@ def check_frame(hand: Hand) -> None:
                 f"of body {hand.palm!r} must have fingers +z, palm normal +x"
             )
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
-    side = -1.0 if "left" in hand.name.lower() else 1.0
-    if aside * side < -_SIDEWAYS:
+    if aside * hand.thumb_side < -_SIDEWAYS:
+        sides = "-+" if hand.side == "right" else "+-"
         raise AssetError(
-            f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {'-' if side > 0 else '+'}y, "
-            f"expected {'+' if side > 0 else '-'}y: turn the palm frame; only a left hand's name says left"
+            f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected "
+            f'{sides[1]}y of a {hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
         )
 
 

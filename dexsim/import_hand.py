@@ -84,8 +84,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     axes = (parse_axis(text) if text else None for text in (arguments.fingers, arguments.normal))
     anatomy = orient(source, thumb=arguments.thumb, along=next(axes), normal=next(axes))
-    if anatomy.left and "left" not in name.lower():
-        name += "_left"
     print("\n".join(frame_lines(anatomy)))
     if not arguments.yes:
         _confirm()
@@ -130,8 +128,7 @@ def frame_lines(anatomy: Anatomy) -> list[str]:
         f"{source.name}: {source.kind}, {motors} motors, {len(links) - 1 - motors} joints that follow them",
         f"palm         body {links[0].name}",
         f"fingers      {fingers}",
-        f"palm frame   fingers along {_axis(z)} of the file's body, palm facing {_axis(x)}; "
-        f"a {'left' if anatomy.left else 'right'} hand",
+        f"palm frame   fingers along {_axis(z)} of the file's body, palm facing {_axis(x)}; a {anatomy.side} hand",
     ]
     if source.frozen:
         lines.append(f"frozen at 0  {', '.join(source.frozen)}: above the palm, or by --freeze")
@@ -198,6 +195,7 @@ def make_sheet(
     frame = f"palm frame in that of {links[0].name}: x {_axis(anatomy.rotation[0])}, z {_axis(anatomy.rotation[2])}"
     sheet = HandSheet(
         name=name,
+        side=anatomy.side,
         links=links,
         palm=palm,
         capsules=capsules,

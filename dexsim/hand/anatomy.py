@@ -38,11 +38,11 @@ class Anatomy:
     doubts: tuple[str, ...]
 
     @property
-    def left(self) -> bool:
-        """Whether the thumb is on the side of -y."""
+    def side(self) -> str:
+        """left where the thumb is on the side of -y, else right."""
         links = self.description.links
         roots = np.array([_joint(links[finger.links[0]]).anchor[1] for finger in self.fingers])
-        return bool(roots[0] < roots[1:].mean())
+        return "left" if roots[0] < roots[1:].mean() else "right"
 
 
 def orient(
@@ -84,7 +84,7 @@ def orient(
         reversed=changed,
         doubts=tuple(doubts),
     )
-    side, other = ("left", "right") if anatomy.left else ("right", "left")
+    side, other = anatomy.side, "right" if anatomy.side == "left" else "left"
     names = " ".join([description.name, *(link.name for link in links)]).lower()
     if other in names and side not in names:
         doubt = f"the file's names say {other}, the thumb is where a {side} hand has it: check the palm frame"

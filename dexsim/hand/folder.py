@@ -36,6 +36,7 @@ class HandSheet:
     first, with limits known; `capsules` are those of the links by their index, a fingertip's is its pad."""
 
     name: str
+    side: str  # right or left
     links: tuple[Link, ...]
     palm: PalmBox
     capsules: dict[int, Capsule]
@@ -124,6 +125,7 @@ def _toml(sheet: HandSheet) -> str:
     lines = [
         *(f"# {line}" for line in sheet.remarks),
         f'name = "{sheet.name}"',
+        f'side = "{sheet.side}"',
         f'model = "{sheet.name}.xml"',
         f'palm = "{sheet.links[0].name}"',
         "joints = [" + ", ".join(f'"{name}"' for name in sheet.motors) + "]",

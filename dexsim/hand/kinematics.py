@@ -1,7 +1,7 @@
 """The hand as a static description, and the one kinematics in pure JAX that simulation and hardware share.
 
 Shapes: J joints that have motors, H hinges (more than J where one motor moves two), B bodies, F fingers, N taxels a
-finger. Poses are in the palm frame (fingers +z, palm normal +x, thumb side +y).
+finger. Poses are in the palm frame (fingers +z, palm normal +x, thumb side +y; of a left hand -y).
 """
 
 import dataclasses
@@ -64,8 +64,14 @@ class Hand:
     grasp_centre: tuple[float, ...] = ()  # m, where the object of a grasp belongs; empty: not given
     rotate_posture: tuple[float, ...] = ()  # rad, from which rotations start; empty: not given
     rotate_reference: tuple[float, ...] = ()  # m, where the object of a rotation belongs; empty: not given
+    side: str = "right"  # or "left"
     source: str = ""  # the TOML as it was named, or the name of a shipped hand
     digest: str = ""  # of its files
+
+    @property
+    def thumb_side(self) -> float:
+        """Sign of y on the thumb's side: -1 for a left hand."""
+        return -1.0 if self.side == "left" else 1.0
 
     @property
     def num_joints(self) -> int:

@@ -57,6 +57,8 @@ class HandFile(Config):
     """The TOML of a hand."""
 
     name: str = ""
+    side: str = setting("right", choices=("right", "left"))
+    """Policies see a left hand as its mirror image."""
     model: str
     """The MJCF."""
     palm: str
@@ -142,6 +144,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         grasp_centre=table.grasp.centre or (),
         rotate_posture=table.rotate.posture,
         rotate_reference=table.rotate.reference or (),
+        side=table.side,
         source=shipped_name(path) or str(given),
         digest=digest_of(*files),
     )

@@ -144,7 +144,7 @@ def from_the_cad(model, table):
 
 
 def mirrored(model, table):
-    return model, table.replace('name = "leap_like"', 'name = "leap_left"')
+    return model, table.replace('name = "leap_like"', 'name = "leap_like"\nside = "left"')
 
 
 WRONG = {
@@ -160,7 +160,7 @@ WRONG = {
         "limits are plausible",
         "'thumb_cmc' has a stall torque of 100 Nm, expected 0.02 to 5 Nm .16 joints",
     ),
-    mirrored: ("fingers point along +z", r"the thumb is \d+ mm to the side of \+y, expected -y"),
+    mirrored: ("fingers point along +z", r"the thumb is \d+ mm to the side of \+y, expected -y of a left"),
 }
 
 
