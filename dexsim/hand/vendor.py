@@ -16,6 +16,7 @@ import numpy as np
 from dexsim.core.errors import AssetError
 
 _LEAST_MASS = 1e-3  # kg, of a link that the file gives none
+_NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _LEAST_INERTIA = 1e-7  # kg m^2
 
 
@@ -127,7 +128,12 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> tuple
         root.remove(extra)
     compiler = ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler")
     # MuJoCo would fuse the palm with the world.
-    compiler.attrib |= {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-6", "boundinertia": "1e-10"}
+    compiler.attrib |= {
+        "fusestatic": "false",
+        "balanceinertia": "true",
+        "boundmass": str(_NO_MASS / 2),
+        "boundinertia": "1e-10",
+    }
     return mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode")), shapes
 
 
@@ -315,7 +321,9 @@ class _Reader:
         places = np.zeros((len(members), 3))
         for i, b in enumerate(members):
             rotation = data.xmat[b].reshape(3, 3)
-            places[i] = turn.T @ (data.xpos[b] + rotation @ model.body_ipos[b] - origin)
+            # MuJoCo puts the centre of a body without mass and shape anywhere.
+            arm = model.body_ipos[b] if masses[i] > _NO_MASS else np.zeros(3)
+            places[i] = turn.T @ (data.xpos[b] + rotation @ arm - origin)
             matrix = np.zeros(9)
             mujoco.mju_quat2Mat(matrix, model.body_iquat[b])
             frames[i] = (turn.T @ rotation @ matrix.reshape(3, 3)).ravel()

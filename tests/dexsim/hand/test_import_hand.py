@@ -114,6 +114,8 @@ class TestUrdf:
     def test_limits_and_fits_are_the_files(self, hands):
         _, sheet, lines = hands["plain"]
         assert {(link.joint.torque, link.joint.speed) for link in sheet.links[1:]} == {(0.6, 6.0)}
+        for link in sheet.links[1:]:  # masses are on their links, also where the file gives none
+            assert link.mass >= 1e-3 and np.linalg.norm(link.centre - link.joint.anchor) < 0.025
         bars = [capsule for at, capsule in sheet.capsules.items() if sheet.links[at].name.endswith("link1")]
         assert len(bars) == 4 and all(abs(bar.radius - 0.009) < 3e-4 and bar.mean_error < 2e-4 for bar in bars)
         assert sheet.palm.centre[0] + sheet.palm.half[0] == pytest.approx(0.0, abs=1e-3)
