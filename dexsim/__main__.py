@@ -28,6 +28,7 @@ COMMANDS = {
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
     "mirror-hand": ("dexsim.hand.mirror", "write the mirror image of a hand"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
+    "import-hand": ("dexsim.import_hand", "make a hand's folder from a URDF or MJCF"),
 }
 """Module and purpose of each command."""
 WITHOUT_JAX = ("demo", "view")

@@ -1,6 +1,9 @@
 """Checks the files of a hand: what every hand must fulfil, one line each.
 
 python -m dexsim.check_hand my_hand.toml
+
+Beside what the files need in order to load, it checks the conventions that they follow: palm frame, signs of joints,
+reach of the first grasp, limits.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,14 +22,22 @@ from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
+from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics, hinge_angles
+from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, hinge_angles
 from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.placement import clearance, palm_height
 
 _POSES, _ENVS = 20, 16
 _NEAR, _ALIGNED = 1e-5, 1e-4  # m and rad, of link poses in float32
+TORQUES, SPEEDS = (0.02, 5.0), (0.3, 40.0)
+"""Nm and rad/s: what motors of a hand have. A finger of 10 cm would press with 50 N."""
+_REACH = 0.06  # m, from the object's centre to the nearest fingertip
+_BALL, _OVERLAP = 0.022, 0.002  # m, radius of the smallest sphere of the default objects; depth that start states allow
+_UPRIGHT = 0.5  # share of an open finger's length along +z
+_SIDEWAYS = 0.01  # m, how far a thumb must be to a side for it to have one
 
 
 def check_kinematics(hand: Hand) -> None:
@@ -64,6 +75,107 @@ def check_fingertips(hand: Hand) -> None:
             raise AssetError(f"{hand.model_path}: finger {name!r} has no primitive at its tip that touches (no mesh)")
 
 
+def check_frame(hand: Hand) -> None:
+    """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of -y.
+
+    Raises:
+      AssetError: a finger points elsewhere, or the thumb is on the other side.
+    """
+    pose = forward_kinematics(hand, _open(hand))
+    tips, bodies = np.asarray(pose.tip_position), np.asarray(pose.body_position)
+    roots = np.array([bodies[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
+    for name, arm in list(zip(hand.finger_names, tips - roots, strict=True))[1:]:
+        if arm[2] < _UPRIGHT * np.linalg.norm(arm):
+            way = ", ".join(f"{x:.2f}" for x in arm / np.linalg.norm(arm))
+            raise AssetError(
+                f"{hand.model_path}: finger {name!r} points along ({way}) with its joints at 0, expected +z: the frame "
+                f"of body {hand.palm!r} must have fingers +z, palm normal +x"
+            )
+    aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
+    if aside * hand.thumb_side < -_SIDEWAYS:
+        sides = "-+" if hand.side == "right" else "+-"
+        raise AssetError(
+            f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected "
+            f'{sides[1]}y of a {hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
+        )
+
+
+def check_signs(hand: Hand) -> None:
+    """Positive angles close: a finger's tip moves toward the palm's normal from where it is open, the thumb's to where
+    its taxels face in the grasp.
+
+    Raises:
+      AssetError: names the joints that open.
+    """
+    opened, wrong = _open(hand), []
+    grasp = np.asarray(hand.grasp_posture, np.float32) if hand.grasp_posture else opened
+    for finger in range(hand.num_fingers):
+        posture = grasp if finger == 0 else opened
+        jacobian = np.asarray(jax.jacfwd(lambda q, f=finger: forward_kinematics(hand, q).tip_position[f])(posture))
+        way = np.array([1.0, 0.0, 0.0])
+        if finger == 0:
+            frame = np.asarray(forward_kinematics(hand, posture).tip_rotation[finger])
+            way = frame @ hand.taxel_normal[finger].mean(0)
+        for joint in flexion_joints(hand, range(finger, finger + 1)):
+            motion = jacobian[:, joint]
+            if motion @ way < -0.2 * np.linalg.norm(motion) * np.linalg.norm(way):
+                wrong.append(hand.joint_names[joint])
+    if wrong:
+        raise AssetError(
+            f"{hand.model_path}: positive angles open {', '.join(wrong)}: they must close the finger, toward the "
+            "palm's normal +x; negate the joint's axis and range"
+        )
+
+
+def check_reach(hand: Hand) -> None:
+    """The grasp's posture has a fingertip near the object's centre, and room for a ball between fingers and palm.
+
+    Raises:
+      AssetError: says how far away the tips are, or how deep the ball is in a link.
+    """
+    if not hand.grasp_posture or not hand.grasp_centre:
+        raise AssetError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
+    posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
+    away = np.linalg.norm(np.asarray(forward_kinematics(hand, posture).tip_position) - centre, axis=-1)
+    if away.min() > _REACH:
+        raise AssetError(
+            f"{hand.source}: [grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is "
+            f"{1e3 * away.min():.0f} mm from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is "
+            "in the palm frame"
+        )
+    centre[0] = palm_height(hand) + 0.005 + _BALL
+    ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
+    gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
+    if gap < -_OVERLAP:
+        raise AssetError(
+            f"{hand.source}: [grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of "
+            f"{2e3 * _BALL:.0f} mm that lies at centre: open the posture or move centre"
+        )
+
+
+def check_limits(hand: Hand) -> None:
+    """Torques and speeds are those of a hand's motors.
+
+    Raises:
+      AssetError: names the joint with the least plausible one.
+    """
+    for what, values, (low, high), unit in (
+        ("stall torque", hand.torque_limit, TORQUES, "Nm"),
+        ("no-load speed", hand.speed_limit, SPEEDS, "rad/s"),
+    ):
+        odd = np.flatnonzero((values < low) | (values > high))
+        if odd.size:
+            raise AssetError(
+                f"{hand.source}: joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
+                f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
+            )
+
+
+def _open(hand: Hand) -> np.ndarray:
+    """Joint angles [J] rad nearest to 0 that the ranges allow."""
+    return np.clip(np.zeros(hand.num_joints, np.float32), hand.joint_lower, hand.joint_upper)
+
+
 def check_rollout(hand: Hand) -> None:
     """Random actions in the grasp task, as fast as they may change, for a second.
 
@@ -93,6 +205,10 @@ CHECKS: dict[str, Callable[[Hand], None]] = {
     "kinematics agree with MuJoCo": check_kinematics,
     "fingertips touch": check_fingertips,
     "taxels are on the skin": check_taxels,
+    "fingers point along +z, the thumb is at its side": check_frame,
+    "positive angles close": check_signs,
+    "fingertips reach the object": check_reach,
+    "limits are plausible": check_limits,
     "random actions stay finite": check_rollout,
 }
 """What every hand must fulfil, beside what `load_hand` requires."""
@@ -148,6 +264,8 @@ class CheckHandArguments:
 
     hand: Annotated[Path, tyro.conf.Positional]
     """The TOML of a hand, or the name of a shipped one."""
+    view: bool = False
+    """Then show the hand in the browser, at the start of a grasp."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -155,7 +273,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     description = "Check the TOML of a hand and the files that it names."
     arguments = cli.parse(CheckHandArguments, argv, prog="python -m dexsim.check_hand", description=description)
     lines, passed = report(arguments.hand)
-    print("\n".join(lines))
+    print("\n".join(lines), flush=True)
+    if passed and arguments.view:
+        from dexsim.view.__main__ import main as show
+
+        return show(["grasp", "--hand", str(arguments.hand)])
     return 0 if passed else 1
 
 

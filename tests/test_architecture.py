@@ -29,8 +29,10 @@ FLOORS = {
         ("env",),
         ("tasks",),
         ("registry",),
-        ("catalog", "check_hand", "wrappers"),
+        ("catalog", "wrappers"),
         ("view",),
+        ("check_hand",),
+        ("import_hand",),
         ("__main__",),
         ("",),
     ),
@@ -79,7 +81,7 @@ BUDGETS = {
 
 FOREIGN = {
     "dexsim": (),
-    "dexsim.view": ("dexsim_ppo", "dexsim_real"),  # a command over all three, which nothing imports
+    "dexsim.view": ("dexsim_ppo", "dexsim_real"),  # a command over all three
     "dexsim_ppo.learner": ("dexsim.core",),
     "dexsim_ppo": ("dexsim",),
     "dexsim_real": ("dexsim", "dexsim_ppo"),

@@ -10,11 +10,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import sys
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import label
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -22,6 +26,12 @@ from dexsim.core.errors import AssetError
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
+_SAME = 3**0.5 * 1e-7  # share of a mesh's size: corners nearer to each other than this are one
+REPAIRS = ("none", "shell", "hull")
+"""What `load_mesh` does with a mesh that is not closed."""
+_CELLS = 48  # of a shell's grid along the longest side
+_SAMPLES = 50_000  # points on a surface that stand for it
+_CLOSE = 0.25  # cells, distance of a shell from the surface that it closes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,15 +90,20 @@ class Mesh:
         return np.concatenate([normal[:, None], at_edge[edge], at_vertex[faces]], 1)
 
 
-def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Mesh:
+def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repair: str = "none") -> Mesh:
     """Read a mesh file, or take a `trimesh.Trimesh` or a pair (vertices, faces), and check it.
+
+    Corners at the same place, within 1.7e-7 of the mesh's size, become one: STL repeats them.
 
     Args:
       source: path (any format that trimesh reads), mesh object or arrays.
       scale: factor on the coordinates; 0.001 for files in millimetres.
+      repair: one of REPAIRS, for a mesh that fails the check. shell: its voxel shell, with cavities filled; hull: its
+        convex hull. Says on standard error how far from the given surface the result is.
 
     Raises:
-      AssetError: not readable, not finite, of no graspable size, open, with inconsistent or inward normals, or flat.
+      AssetError: not readable, not finite, of no graspable size, open, non-manifold, with inconsistent or inward
+        normals, or flat.
     """
     vertices, faces, given = _read(source)
     name = name or given
@@ -101,8 +116,16 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Me
             f"{name}: {size:.3g} m across at scale {scale:g}, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
             "metres, pass scale=0.001 for a file in millimetres (ObjectConfig.mesh_unit)"
         )
-    vertices, faces = _merge(vertices, faces, 1e-7 * size)
-    _check_closed(name, vertices, faces, size)
+    vertices, faces = _merge(vertices, faces, _SAME * size)
+    try:
+        _check_closed(name, vertices, faces, size)
+    except AssetError as error:
+        if repair == "none":
+            raise
+        before = vertices, faces
+        vertices, faces = _merge(*(_shell if repair == "shell" else _hull)(*before), _SAME * size)
+        _check_closed(f"{name} after repair", vertices, faces, size)
+        print(f"{error}; its {repair} is {1e3 * _deviation(before, (vertices, faces)):.2g} mm away", file=sys.stderr)
     return Mesh(name, vertices, faces)
 
 
@@ -185,10 +208,13 @@ def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def _merge(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at the same place become one (STL repeats them); triangles that vanish by it are dropped."""
-    cell = np.round(vertices / tolerance).astype(np.int64)
-    _, first, inverse = np.unique(cell, axis=0, return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[faces]
+    """Vertices within `tolerance` m of each other become one; triangles that vanish by it are dropped."""
+    vertices, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    pairs = cKDTree(vertices).query_pairs(tolerance, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices), len(vertices)))
+    _, group = connected_components(graph, directed=False)
+    _, first = np.unique(group, return_index=True)
+    faces = group[inverse.reshape(-1)][faces]
     keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return vertices[first], faces[keep]
 
@@ -199,7 +225,12 @@ def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: floa
 
     surface = trimesh.Trimesh(vertices, faces, process=False)
     if not surface.is_watertight:
-        raise AssetError(f"{name}: the surface is open; close it (trimesh.repair) or use its convex hull")
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+        count = np.unique(edges, axis=0, return_counts=True)[1]
+        single, many = np.sum(count == 1), np.sum(count > 2)
+        what = f"open: {single} edges have one triangle" if single else "non-manifold"
+        more = f"{'; ' if single else ': '}{many} edges have more than two" if many else ""
+        raise AssetError(f"{name}: the surface is {what}{more} (ObjectConfig.mesh_repair closes it: shell or hull)")
     if not surface.is_winding_consistent:
         raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
     volume = float(surface.volume)
@@ -207,6 +238,73 @@ def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: floa
         raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
     if volume < 0:
         raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
+
+
+def _hull(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
+    return np.asarray(hull.vertices), np.asarray(hull.faces)
+
+
+def _shell(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A closed surface round another one: all that cannot be reached from outside through gaps of less than two cells
+    is inside. It is the boundary of cells, pulled to the surface."""
+    points = _points_on(vertices, faces)
+    cell = np.ptp(points, axis=0).max() / _CELLS
+    low = points.min(0) - 3 * cell
+    count = np.ceil((points.max(0) + 3 * cell - low) / cell).astype(int)
+    middles = low + cell * (np.indices(count).reshape(3, -1).T + 0.5)
+    tree = cKDTree(points)
+    regions, _ = label(tree.query(middles, distance_upper_bound=cell)[0].reshape(count) > cell)
+    solid = regions != regions[0, 0, 0]
+    _fill_diagonals(solid)
+    corners, triangles = _boundary(solid)
+    corners = low + cell * corners
+    _, nearest = tree.query(corners)
+    return points[nearest] + _CLOSE * (corners - points[nearest]), triangles
+
+
+def _fill_diagonals(solid: np.ndarray) -> None:
+    """Fill cells [X, Y, Z] until no two of them meet in an edge alone, where four faces would meet."""
+    changed = True
+    while changed:
+        changed = False
+        for axis in range(3):
+            view = np.moveaxis(solid, axis, 2)
+            a, b, c, d = view[:-1, :-1], view[1:, :-1], view[:-1, 1:], view[1:, 1:]
+            for full, empty in (((a, d), (b, c)), ((b, c), (a, d))):
+                bad = full[0] & full[1] & ~empty[0] & ~empty[1]
+                changed |= bool(bad.any())
+                empty[0][bad] = True
+
+
+def _boundary(solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [V, 3], in cells, and outward triangles [T, 3] of the faces between full and empty cells."""
+    shape, quads = np.array(solid.shape) + 1, []
+    for axis in range(3):
+        across, along = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+        step = np.diff(solid.astype(np.int8), axis=axis)
+        rings = {-1: (0 * across, across, across + along, along), 1: (0 * across, along, across + along, across)}
+        for sign, ring in rings.items():
+            start = np.argwhere(step == sign) + np.eye(3, dtype=int)[axis]
+            quads.append(np.stack([np.ravel_multi_index((start + corner).T, shape) for corner in ring], -1))
+    quad = np.concatenate(quads)
+    used, inverse = np.unique(quad, return_inverse=True)
+    quad = inverse.reshape(quad.shape)
+    return np.stack(np.unravel_index(used, shape), -1), np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+
+
+def _points_on(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Random points on a surface, and its corners."""
+    points, _, _ = sample_surface(Mesh("", vertices, faces), _SAMPLES, np.random.default_rng(0))
+    return np.concatenate([points, vertices])
+
+
+def _deviation(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+    """The largest distance m of a point of either surface from the other one, between samples."""
+    a, b = _points_on(*one), _points_on(*other)
+    return float(max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max()))
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
+from dexsim.geometry.mesh import REPAIRS
 from dexsim.objects.mesh import MeshObject, load
 
 SLOTS = ("box", "capsule", "cylinder")
@@ -42,6 +43,8 @@ class ObjectConfig(Config):
     fingers in a grasp, its x axis is normal to the palm in a rotation."""
     mesh_unit: float = setting(1.0, unit="m", low=1e-6, high=100.0)
     """Length of that file's unit: 0.001 for millimetres."""
+    mesh_repair: str = setting("none", choices=REPAIRS)
+    """What to do with a mesh that is not closed: take its voxel shell or its convex hull. The deviation is printed."""
     mesh_size: Range = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
     """Factor on the mesh's size."""
     mesh_parts: int = setting(6, unit="1", low=1, high=24)
@@ -125,7 +128,7 @@ def load_mesh_object(config: ObjectConfig) -> MeshObject:
     Raises:
       AssetError: see `dexsim.objects.mesh.load`.
     """
-    return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts)
+    return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts, repair=config.mesh_repair)
 
 
 def nominal(config: ObjectConfig, name: str) -> float:

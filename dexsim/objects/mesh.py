@@ -34,22 +34,23 @@ class MeshObject:
         return ("box",) * len(self.boxes.size)
 
 
-def load(path: str, *, unit: float, parts: int) -> MeshObject:
-    """The object of a mesh file, in any format that trimesh reads, with `parts` boxes at most; `unit` is the file's, m.
+def load(path: str, *, unit: float, parts: int, repair: str = "none") -> MeshObject:
+    """The object of a mesh file, in any format that trimesh reads, with `parts` boxes at most; `unit` is the file's, m,
+    and `repair` what to do if it is not closed (`geometry.mesh.load_mesh`).
 
     Raises:
       AssetError: no such file, not closed, or not to be followed by so many boxes.
     """
     file = Path(path).expanduser()
     changed = file.stat().st_mtime_ns if file.is_file() else 0
-    return _load(str(file), changed, unit, parts)
+    return _load(str(file), changed, unit, parts, repair)
 
 
 @lru_cache(maxsize=8)
-def _load(path: str, changed: int, unit: float, parts: int) -> MeshObject:
+def _load(path: str, changed: int, unit: float, parts: int, repair: str) -> MeshObject:
     del changed
     with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
-        return from_mesh(meshes.load_mesh(path, scale=unit), parts)
+        return from_mesh(meshes.load_mesh(path, scale=unit, repair=repair), parts)
 
 
 def from_mesh(mesh: meshes.Mesh, parts: int) -> MeshObject:

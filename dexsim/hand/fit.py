@@ -1,0 +1,80 @@
+"""Primitives in place of a link's meshes: a capsule for a link, a box and its face for a palm."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+_SAMPLES = 600
+_CELL = 5e-3  # m, of the grid on which a palm's face is measured
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Capsule:
+    """A segment [2, 3] m and a radius m, with how far the link's convex hull is from its surface, m."""
+
+    ends: np.ndarray
+    radius: float
+    mean_error: float
+    largest_error: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PalmBox:
+    """A box along the palm's axes: its middle and half-extents [3] m. Its face is at the largest x."""
+
+    centre: np.ndarray
+    half: np.ndarray
+    largest_error: float  # m, how far the palm reaches beyond it
+
+
+def fit_capsule(surface: Any, along: np.ndarray) -> Capsule:
+    """The capsule with the least squared distance to samples of a link's convex hull; objects meet nothing but the
+    hull. It begins from an axis [3] `along` the link."""
+    points = _sample(surface.convex_hull, _SAMPLES)
+    middle = (points.max(0) + points.min(0)) / 2
+    spread = (points - middle) @ along
+    radius = np.median(np.linalg.norm(points - middle - np.outer(spread, along), axis=1))
+    half = max(np.ptp(spread) / 2 - radius, 1e-3)
+    start = np.concatenate([middle - half * along, middle + half * along, [radius]])
+
+    def error(x: np.ndarray) -> np.ndarray:
+        return segment_distance(points, x[:3], x[3:6]) - x[6]
+
+    best = least_squares(error, start, x_scale=0.01, max_nfev=100).x
+    away = np.abs(error(best))
+    ends = best[:6].reshape(2, 3)
+    if (ends[1] - ends[0]) @ along < 0:
+        ends = ends[::-1]
+    return Capsule(
+        ends=ends, radius=float(abs(best[6])), mean_error=float(away.mean()), largest_error=float(away.max())
+    )
+
+
+def fit_palm(surface: Any) -> PalmBox:
+    """The box of a palm. Its face is where most of the front is: mounts of thumb and fingers stand out of it."""
+    points = _sample(surface, 40 * _SAMPLES)
+    low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
+    cells = np.floor((points[:, 1:] - low[1:]) / _CELL).astype(int)
+    front: dict[tuple[int, int], float] = {}
+    for (row, column), x in zip(cells.tolist(), points[:, 0].tolist(), strict=True):
+        front[row, column] = max(x, front.get((row, column), -np.inf))
+    high[0] = np.percentile(list(front.values()), 70)
+    half = np.maximum((high - low) / 2, 2e-3)
+    beyond = np.maximum(low - points.min(0), points.max(0) - high).max()
+    return PalmBox(centre=(low + high) / 2, half=half, largest_error=float(beyond))
+
+
+def segment_distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance [...] m of points [..., 3] from the segment between a and b [..., 3]."""
+    arm, span = points - a, b - a
+    share = np.clip(np.sum(arm * span, -1) / np.maximum(np.sum(span * span, -1), 1e-12), 0, 1)
+    return np.linalg.norm(arm - share[..., None] * span, axis=-1)
+
+
+def _sample(surface: Any, count: int) -> np.ndarray:
+    """Points [count, 3] on a surface, uniform by area, the same ones every time."""
+    import trimesh
+
+    return np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0])

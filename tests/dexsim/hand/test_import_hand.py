@@ -1,0 +1,236 @@
+"""Hands from makers' files. The stand-ins have the quirks of public ones: a URDF's frames and packages, joints that are
+turned round, a wrist above the palm, followers, tendons, absent meshes and torques."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dexsim import check_hand, import_hand
+from dexsim.core.errors import AssetError, ConfigError
+from dexsim.hand.anatomy import orient
+from dexsim.hand.fit import fit_capsule, fit_palm, segment_distance
+from dexsim.hand.folder import write_hand
+from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.load import load_hand
+from dexsim.hand.vendor import read_description
+
+TURN = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()  # of the file's palm against ours
+ROOTS = {"index": (0, 0.035, 0.09), "middle": (0, 0.01, 0.095), "ring": (0, -0.015, 0.09), "thumb": (0.01, 0.05, 0.02)}
+LENGTHS = (0.04, 0.03)
+
+
+def urdf(folder, *, name="hand", reverse=(), turn=TURN, effort="0.6", extra="", meshes=True, mirror=False):
+    """A hand of eleven motors and a wrist: three fingers of two hinges that a hinge spreads, and a thumb that turns and
+    bends twice. Meshes are STL of a package, one of the links is a box."""
+    (folder / "meshes").mkdir(exist_ok=True)
+    side = np.diag([1.0, -1.0, 1.0]) if mirror else np.eye(3)
+    if meshes:
+        for part, length in enumerate(LENGTHS):
+            bar = trimesh.creation.capsule(height=length - 0.01, radius=0.009, count=[16, 16])
+            bar.apply_translation([0, 0, length / 2 - bar.bounds.mean(0)[2]])
+            bar.apply_transform(transform(turn))
+            bar.export(folder / "meshes" / f"bar{part}.stl")
+    rpy = " ".join(f"{x:.9f}" for x in Rotation.from_matrix(turn).as_euler("xyz"))
+    palm = '<visual><origin xyz="{}" rpy="{}"/><geometry><box size="0.03 0.1 0.1"/></geometry></visual>'
+    links = [
+        '<link name="forearm"/>',
+        f'<link name="palm">{palm.format(vector(turn @ [-0.015, 0, 0.04]), rpy)}<inertial><mass value="0.3"/>'
+        '<inertia ixx="3e-4" iyy="3e-4" izz="3e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>',
+    ]
+    joints = [joint("wrist", "forearm", "palm", [0, 0, 0.1], [1, 0, 0], (-0.5, 0.5), effort)]
+    for finger, root in ROOTS.items():
+        thumb, above, place = finger == "thumb", "palm", side @ np.array(root)
+        # The thumb turns about the palm's z and bends toward the fingers.
+        first, bend = ((0, 0, -1), (1, 0, 0)) if thumb else ((1, 0, 0), (0, 1, 0))
+        if thumb:
+            first, bend = side @ first * np.linalg.det(side), -side @ bend * np.linalg.det(side)
+        span = (0.0, 1.4) if thumb else (-0.3, 0.3)
+        for part, axis in enumerate((first, bend, bend)):
+            child, hinge = f"{finger}_link{part}", f"{finger}_{part}"
+            low, high = span if part == 0 else (0.0 if thumb else -0.1, 1.6)
+            if hinge in reverse:
+                axis, low, high = -np.array(axis), -high, -low
+            joints.append(joint(hinge, above, child, turn @ place, turn @ axis, (low, high), effort))
+            length = 0.0 if part == 0 else LENGTHS[part - 1]
+            way = np.array([0, 0, 1.0]) if not thumb else side @ np.array([0, 0.8, 0.6])
+            tilt = Rotation.align_vectors([turn @ way], [turn @ [0, 0, 1.0]])[0].as_euler("xyz")
+            file = f'<mesh filename="package://{name}_description/meshes/bar{part - 1}.stl"/>'
+            shape = f'<origin rpy="{vector(tilt)}"/><geometry>{file}</geometry>'
+            links.append(f'<link name="{child}">' + (f"<visual>{shape}</visual>" if part else "") + "</link>")
+            above, place = child, length * way
+    path = folder / f"{name}.urdf"
+    path.write_text(f'<robot name="{name}">{"".join(links)}{"".join(joints)}{extra}</robot>')
+    return path
+
+
+def joint(name, parent, child, place, axis, span, effort):
+    limit = f'<limit lower="{span[0]}" upper="{span[1]}" effort="{effort}" velocity="6"/>'
+    where = f'<origin xyz="{vector(place)}"/><axis xyz="{vector(axis)}"/>'
+    return (
+        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>{where}{limit}</joint>'
+    )
+
+
+def vector(values):
+    return " ".join(f"{x:.9f}" for x in values)
+
+
+def transform(turn):
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    return matrix
+
+
+def sheet_of(path, **options):
+    anatomy = orient(read_description(path, **options))
+    return anatomy, *import_hand.make_sheet(anatomy, "hand", 0.0, 0.0, path.name, 0.006)
+
+
+@pytest.fixture(scope="module")
+def hands(tmp_path_factory):
+    """The same hand as it should be, with joints turned round, and mirrored."""
+    cases = {"plain": {}, "reversed": {"reverse": ("index_1", "middle_2", "thumb_2")}, "left": {"mirror": True}}
+    return {name: sheet_of(urdf(tmp_path_factory.mktemp(name), **options)) for name, options in cases.items()}
+
+
+class TestUrdf:
+    @pytest.mark.parametrize("name", ["plain", "reversed", "left"])
+    def test_palm_frame_fingers_and_side_are_found(self, hands, name):
+        anatomy, _, _ = hands[name]
+        np.testing.assert_allclose(anatomy.rotation, TURN.T, atol=0.02)
+        assert [finger.name for finger in anatomy.fingers] == ["thumb", "index", "middle", "ring"]
+        assert anatomy.side == ("left" if name == "left" else "right") and anatomy.description.frozen == ("wrist",)
+        assert anatomy.reversed == (("index_1", "middle_2", "thumb_2") if name == "reversed" else ())
+
+    def test_turned_joints_give_the_same_hand(self, hands):
+        plain, other = (
+            {link.name: link.joint for link in hands[name][0].description.links[1:]} for name in ("plain", "reversed")
+        )
+        for name, hinge in plain.items():
+            np.testing.assert_allclose([hinge.low, hinge.high], [other[name].low, other[name].high])
+            np.testing.assert_allclose(hinge.axis, other[name].axis, atol=1e-6)
+
+    def test_limits_and_fits_are_the_files(self, hands):
+        _, sheet, lines = hands["plain"]
+        assert {(link.joint.torque, link.joint.speed) for link in sheet.links[1:]} == {(0.6, 6.0)}
+        for link in sheet.links[1:]:  # masses are on their links, also where the file gives none
+            assert link.mass >= 1e-3 and np.linalg.norm(link.centre - link.joint.anchor) < 0.025
+        bars = [capsule for at, capsule in sheet.capsules.items() if sheet.links[at].name.endswith("link1")]
+        assert len(bars) == 4 and all(abs(bar.radius - 0.009) < 3e-4 and bar.mean_error < 2e-4 for bar in bars)
+        assert sheet.palm.centre[0] + sheet.palm.half[0] == pytest.approx(0.0, abs=1e-3)
+        assert any("4 of 4 fingertips" in line for line in lines), lines
+
+    @pytest.mark.parametrize("name", ["plain", "left"])
+    def test_a_written_hand_keeps_the_conventions(self, hands, name, tmp_path):
+        hand = load_hand(write_hand(hands[name][1], tmp_path))
+        for what, check in check_hand.CHECKS.items():
+            if "random" not in what:
+                check(hand)
+        # Tips in closed form: roots, lengths, and the last capsule's end, 4 mm beyond its link's and less the rubber.
+        tips = np.asarray(forward_kinematics(hand, np.zeros(12, np.float32)).tip_position)
+        np.testing.assert_allclose(tips[1:, 2], np.array([0.09, 0.095, 0.09]) + sum(LENGTHS) + 0.004 - 0.003, atol=1e-3)
+
+
+def test_the_whole_command(tmp_path, capsys):
+    """With followers, absent torques and an absent mesh, up to a check that passes."""
+    mimic = '<mimic joint="{0}_1" multiplier="0.8" offset="0.1"/></joint>'
+    path = urdf(tmp_path, effort="1000", turn=np.eye(3))
+    text = path.read_text()
+    for finger in ROOTS:
+        head, tail = text.split(f'<joint name="{finger}_2"')
+        text = head + f'<joint name="{finger}_2"' + tail.replace("</joint>", mimic.format(finger), 1)
+    path.write_text(text.replace("bar1.stl", "lost.stl"))
+    assert import_hand.main([str(path), "--out", str(tmp_path / "out"), "--yes"]) == 0
+    said = capsys.readouterr().out
+    for line in ("8 motors, 4 joints that follow", "frozen at 0  wrist", "torque 1 Nm at 8 motors: the file says 1000",
+                 "lost.stl", "fingertip of 25 mm", "ok    random actions stay finite"):  # fmt: skip
+        assert line in said
+    hand = load_hand(tmp_path / "out" / "out.toml")
+    assert hand.num_joints == 8 and hand.num_hinges == 12
+    np.testing.assert_allclose(sorted(set(hand.body_ratio.round(5))), [0.8, 1.0])
+
+
+MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size="0.015 0.05 0.05"/>
+{}</body></worldbody>{}</mujoco>"""
+CHAIN = """<body name="{0}" pos="0 {1} 0.05"><joint name="{0}_a" axis="0 1 0" range="0 1.5"/>
+<geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.03"/><body name="{0}b" pos="0 0 0.03">
+<joint name="{0}_b" axis="0 1 0" range="0 1.5"/><geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.025"/></body>
+</body>"""
+ACTUATORS = """<actuator><position joint="thumb_a" forcerange="-0.4 0.4"/>
+<motor joint="f_a" ctrlrange="-1 1" gear="0.3"/>
+</actuator>"""
+TENDON = '<tendon><fixed name="cord"><joint joint="f_a" coef="1"/><joint joint="f_b" coef="1"/></fixed></tendon>'
+
+
+def mjcf(folder, tail="", bodies=("thumb", "f", "g")):
+    path = folder / "hand.xml"
+    chains = "".join(CHAIN.format(name, 0.04 - 0.03 * i) for i, name in enumerate(bodies))
+    path.write_text(MJCF.format(chains, tail))
+    return path
+
+
+def test_torques_of_an_mjcf_stand_at_its_actuators(tmp_path):
+    source = read_description(mjcf(tmp_path, ACTUATORS))
+    torques = {link.joint.name: link.joint.torque for link in source.links[1:]}
+    assert torques["thumb_a"] == 0.4 and torques["f_a"] == pytest.approx(0.3) and torques["g_a"] == 0.0
+
+
+def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
+    path = mjcf(tmp_path, TENDON)
+    source = read_description(path, drop_tendons=True, couple=("f_b=f_a:0.7",))
+    (follower,) = (link.joint for link in source.links[1:] if link.joint.leader)
+    assert (follower.name, follower.leader, follower.ratio) == ("f_b", "f_a", 0.7)
+
+
+REFUSED = {
+    "tendon": (dict(tail=TENDON), {}, "tendons cord: not supported; --drop-tendons .* --couple"),
+    "one finger": (dict(bodies=("f",)), {}, "two fingers or more, got 1"),
+    "no such palm": ({}, dict(palm="hand"), "--palm hand: no such body; it has palm, thumb"),
+    "no such joint": ({}, dict(freeze=("wrist",)), "--freeze wrist: no such joint; it has thumb_a"),
+    "couple": ({}, dict(couple=("f_b",)), "--couple f_b: expected FOLLOWER=LEADER:RATIO"),
+    "polynomial": (
+        dict(tail='<equality><joint joint1="f_b" joint2="f_a" polycoef="0 1 0.2 0 0"/></equality>'),
+        {},
+        "'f_b' follows 'f_a' by the polynomial",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_imported_is_one_line(tmp_path, what):
+    file, options, says = REFUSED[what]
+    with pytest.raises(AssetError, match=says):
+        read_description(mjcf(tmp_path, **file), **options)
+
+
+def test_the_frame_is_confirmed(tmp_path):
+    with pytest.raises(ConfigError, match="not a terminal: --yes accepts"):
+        import_hand.main([str(mjcf(tmp_path)), "--out", str(tmp_path)])
+    np.testing.assert_allclose(import_hand.parse_axis("-y"), [0, -1, 0])
+    np.testing.assert_allclose(import_hand.parse_axis("0,3,4"), [0, 0.6, 0.8])
+    with pytest.raises(ConfigError, match="axis 'up'"):
+        import_hand.parse_axis("up")
+
+
+def test_a_capsule_is_fitted_to_itself():
+    """Ends and radius come back within the facets of the mesh, however it lies."""
+    turn, radius, length = Rotation.from_euler("xyz", [0.3, 1.2, -0.7]).as_matrix(), 0.008, 0.03
+    bar = trimesh.creation.capsule(height=length, radius=radius, count=[32, 32])
+    bar.apply_translation([0, 0, -bar.bounds.mean(0)[2]])
+    bar.apply_transform(transform(turn))
+    fit = fit_capsule(bar, turn @ [0.1, 0, 0.995])
+    np.testing.assert_allclose(fit.ends, [-length / 2 * turn[:, 2], length / 2 * turn[:, 2]], atol=3e-4)
+    assert abs(fit.radius - radius) < 1e-4 and fit.largest_error < 3e-4
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
+    steps = fit.ends[0] + np.linspace(0, 1, 2001)[:, None] * (fit.ends[1] - fit.ends[0])
+    brute = np.linalg.norm(points[:, None] - steps, axis=-1).min(1)
+    np.testing.assert_allclose(segment_distance(points, *fit.ends), brute, atol=1e-5)
+
+
+def test_mounts_do_not_raise_a_palms_face():
+    palm = trimesh.creation.box((0.03, 0.09, 0.1))
+    mount = trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02, 0.03, -0.03))
+    box = fit_palm(trimesh.util.concatenate([palm, mount]))
+    assert box.centre[0] + box.half[0] == pytest.approx(0.015, abs=1e-3)
+    np.testing.assert_allclose(box.half[1:], [0.045, 0.05], atol=2e-3)
