@@ -10,6 +10,7 @@ writes the same formats from such a log. An .npz holds what the live view draws,
 
 import dataclasses
 import io
+import operator
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -73,7 +74,7 @@ def draw_pictures(env: Any, snapshots: Snapshot) -> np.ndarray:
     bare = dataclasses.replace(snapshots, taxel_force=np.zeros_like(snapshots.taxel_force), goal_rotation=None)
     camera, files = camera_of(env.name, env.hand), []
     for t, pose in enumerate(hand_poses(env.hand, snapshots.joint_position)):
-        frame = bare.map(lambda x, t=t: x[t])
+        frame = bare.map(operator.itemgetter(t))
         file = io.BytesIO()
         Image.fromarray(draw_scene(env.hand, env.primitive_kinds, frame, pose, camera, _PICTURE, 1.0)).save(file, "PNG")
         files.append(file.getvalue())
@@ -125,8 +126,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         cli.check_writable(arguments.npz)
     cli.enable_caches()
     env = policy.make_env()
-    numbers = {"episodes": arguments.episodes, "seconds": arguments.seconds, "seed": arguments.seed}
-    trajectories, snapshots = record(policy, env, **numbers)
+    trajectories, snapshots = record(
+        policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed
+    )
     if arguments.lerobot:
         if arguments.pictures:
             pairs = zip(trajectories, snapshots, strict=True)

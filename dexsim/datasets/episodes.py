@@ -7,6 +7,7 @@ numbers are float16, which is 1 mrad at 1 rad, 0.1 mm at 0.1 m and 1 mN at 1 N.
 import dataclasses
 import io
 import json
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,8 @@ def read_episodes(path: Path, hand: str = "") -> Episodes:
         header = json.loads(str(arrays.pop("header")))
         arrays = {name: x.astype(np.float32) if x.dtype == np.float16 else x for name, x in arrays.items()}
         whole, ends = Snapshot(**arrays), np.cumsum(header["lengths"])
-        snapshots = [whole.map(lambda x, a=a, b=b: x[a:b]) for a, b in zip([0, *ends], ends, strict=False)]
+        parts = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
+        snapshots = [whole.map(operator.itemgetter(part)) for part in parts]
         task, period, kinds = header["task"], header["period"], tuple(header["kinds"])
     except (KeyError, TypeError, ValueError, EOFError) as error:
         raise DexsimError(f"{path}: no recorded episodes: {error}") from None

@@ -122,7 +122,7 @@ def mirror_toml(text: str, stem: str) -> str:
 
 def mirror_mjcf(model: ElementTree.Element) -> None:
     """Mirror an MJCF without includes, in place."""
-    order = next((c.get("eulerseq") for c in model.iter("compiler") if c.get("eulerseq")), "xyz")
+    order = next((c.attrib["eulerseq"] for c in model.iter("compiler") if "eulerseq" in c.attrib), "xyz")
     signs = _SIGNS | {"euler": tuple(i for i, axis in enumerate(order.lower()) if axis != "y")}
     first = model.find("default")
     if first is None:

@@ -301,11 +301,12 @@ def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: floa
 
 def torque_constants(calibration: Calibration) -> np.ndarray:
     """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
-    return calibration.sim.gain / calibration.real.gain
+    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
 
 
 def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
     """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
     value = torque_constants(calibration)
-    share = np.hypot(*((side.gain_high - side.gain_low) / 2 / np.abs(side.gain) for side in _sides(calibration)))
+    real, sim = (np.asarray((side.gain_high - side.gain_low) / 2 / np.abs(side.gain)) for side in _sides(calibration))
+    share = np.hypot(real, sim)
     return value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])

@@ -42,9 +42,9 @@ class Start(NamedTuple):
 
 def start_of(hand: Hand, task: str) -> Start:
     """The start on the XHand, or of a grasp by the TOML of another hand. HandError: its TOML has no grasp."""
-    if hand.num_joints == len(POSTURES[task]):
+    if (hand.num_joints, hand.num_taxels) == (len(POSTURES[task]), 120):
         side = np.array([1.0, hand.thumb_side, 1.0])
-        return Start(np.array(POSTURES[task]), REFERENCES[task] * side, PLACES[task] * side[1:])
+        return Start(np.array(POSTURES[task]), np.array(REFERENCES[task]) * side, np.array(PLACES[task]) * side[1:])
     if task != "grasp" or not (hand.grasp_posture and hand.grasp_centre):
         raise HandError(f"{hand.name}: the emulated hand needs a [grasp] with posture and centre in its TOML")
     return Start(np.array(hand.grasp_posture), np.array(hand.grasp_centre), np.array(hand.grasp_centre[1:]))
