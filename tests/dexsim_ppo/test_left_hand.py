@@ -80,6 +80,5 @@ def test_both_hands_do_the_same_in_the_mirror(hand, left, name):
     assert force.sum(1).max() > 1.0 and not dropped.any(), "it is touched, and held"
     there = right.copy()
     there[:, -7:] *= np.concatenate([POLAR, QUAT])
-    print(name, "deviation", np.abs(mirrored - there).max(), np.abs(other_force - force).max(), force.sum(1).max())
     np.testing.assert_allclose(mirrored, there, atol=2e-4)
     np.testing.assert_allclose(other_force, force, atol=0.05)
