@@ -33,9 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     arguments = cli.parse(DemoArguments, argv, prog="dexsim demo", description="Show a shipped policy in the browser.")
     recorded = {path.stem: str(path) for path in sorted(asset_path("episodes").glob("*.npz"))}
-    if arguments.policy not in recorded:
-        raise ConfigError(f"{arguments.policy}: no shipped policy of that name: choose from {', '.join(recorded)}")
-    what = arguments.policy if find_spec("jax") else recorded[arguments.policy]
+    what = arguments.policy if find_spec("jax") else recorded.get(arguments.policy)
+    if what is None:
+        raise ConfigError(f"{arguments.policy}: no recorded episodes: choose from {', '.join(recorded)}")
     return show(ViewArguments(what=what, host=arguments.host, port=arguments.port))
 
 
