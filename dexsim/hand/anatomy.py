@@ -41,8 +41,8 @@ class Anatomy:
     def side(self) -> str:
         """left where the thumb is on the side of -y, else right."""
         links = self.description.links
-        roots = np.array([_joint(links[finger.links[0]]).anchor[1] for finger in self.fingers])
-        return "left" if roots[0] < roots[1:].mean() else "right"
+        thumb, *others = (_aside(links, finger.links) for finger in self.fingers)
+        return "left" if thumb < np.mean(others) else "right"
 
 
 def orient(
@@ -69,11 +69,9 @@ def orient(
     others = [chain for index, chain in enumerate(chains) if index != first]
     rotation = _find_frame(links, others, along, normal)
     links = tuple(_turned(link, rotation) for link in links)
-    order = sorted(others, key=lambda chain: np.mean([_joint(links[at]).anchor[1] for at in chain]))
-    # From the thumb's side on.
-    middle = np.mean([_joint(links[chain[0]]).anchor[1] for chain in others])
-    if _joint(links[chains[first][0]]).anchor[1] > middle:
-        order.reverse()
+    order = sorted(others, key=lambda chain: _aside(links, chain))
+    if _aside(links, chains[first]) > np.mean([_aside(links, chain) for chain in others]):
+        order.reverse()  # from the thumb's side on
     fingers = [Finger(name="thumb", links=tuple(chains[first]))]
     fingers += [Finger(name=name, links=tuple(chain)) for name, chain in zip(_NAMES, order, strict=False)]
     links, changed = _close_positive(links, fingers)
@@ -105,6 +103,11 @@ def tip_of(links: tuple[Link, ...], chain: tuple[int, ...] | list[int]) -> np.nd
     arms = arms - np.outer(arms @ joint.axis, joint.axis)
     reach = np.linalg.norm(arms, axis=1)
     return points[reach > reach.max() - 2e-3].mean(0)
+
+
+def _aside(links: tuple[Link, ...], chain: tuple[int, ...] | list[int]) -> float:
+    """y m of a finger: the mean of its hinges and its tip."""
+    return float(np.mean([*(_joint(links[at]).anchor[1] for at in chain), tip_of(links, chain)[1]]))
 
 
 def flexion_links(links: tuple[Link, ...], chain: tuple[int, ...] | list[int]) -> list[int]:

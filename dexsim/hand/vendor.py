@@ -17,6 +17,7 @@ from dexsim.core.errors import AssetError
 
 _LEAST_MASS = 1e-3  # kg, of a link that the file gives none
 _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
+_NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
 
 
@@ -121,7 +122,7 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> tuple
             link.remove(element)
         inertial = link.find("inertial")
         inertia = None if inertial is None else inertial.find("inertia")
-        if inertial is not None and (inertia is None or np.any(np.linalg.eigvalsh(_tensor(inertia)) <= 0)):
+        if inertial is not None and (inertia is None or np.any(np.linalg.eigvalsh(_tensor(inertia)) < _NO_INERTIA)):
             notes.append(f"link {link.get('name')}: its inertia is no inertia, left out")
             link.remove(inertial)
     for extra in root.findall("mujoco"):
