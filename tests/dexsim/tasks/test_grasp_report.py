@@ -75,6 +75,8 @@ class TestSummary:
         assert found["held"]["mean"] == 1.0 and found["hold_time_s"]["mean"] == pytest.approx(6.0)
         assert found["r_resultant"]["r"] > 0.9999 and found["force_error_n"]["mean"] < 2e-3
         assert found["total_force_monotone"] is True
+        falling = report.summarize(*evaluation(slope=-0.5, noise=1e-3), PERIOD, SPAN)
+        assert falling["total_force_monotone"] is False
         assert found["force_range"] == pytest.approx(5.0, rel=2e-3)
         assert found["non_finite"] == 0
 
