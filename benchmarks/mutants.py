@@ -158,7 +158,7 @@ def main() -> None:
         "hardware": f"{arguments.processes} of {os.cpu_count()} CPU cores",
         "seeds": [arguments.seed],
         "metrics": {"mutants": count, "killed": killed, "survived": survived, "undecided": undecided},
-        "verdict": f"{100 * killed / count:.0f} % noticed by the default tests; target 95 %",
+        "verdict": f"{100 * killed / max(count, 1):.0f} % noticed by the default tests; target 95 %",
         "tags": ["tests"],
         "notes": "",
     }
