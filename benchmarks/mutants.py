@@ -146,9 +146,9 @@ def main() -> None:
                 else:
                     passed.append(mutant)
                     print("SURVIVED" if stage else "nearest tests pass", mutant, flush=True)
-            undecided, left = undecided + len(left), passed
+            undecided, left = len(left), passed  # in the end those that only the nearest tests have let pass
     survived = [str(mutant) for mutant in left]
-    commit, count = _git("rev-parse", "--short=7", "HEAD").strip(), killed + len(survived)
+    commit, count = _git("rev-parse", "--short=7", "HEAD").strip(), killed + len(survived) + undecided
     record = {
         "id": f"mutants-{commit}-seed{arguments.seed}",
         "date": datetime.date.today().isoformat(),
@@ -158,7 +158,7 @@ def main() -> None:
         "hardware": f"{arguments.processes} of {os.cpu_count()} CPU cores",
         "seeds": [arguments.seed],
         "metrics": {"mutants": count, "killed": killed, "survived": survived, "undecided": undecided},
-        "verdict": f"{100 * killed / count:.0f} % noticed by the default tests; target 95 %",
+        "verdict": f"{100 * killed / max(count, 1):.0f} % noticed by the default tests; target 95 %",
         "tags": ["tests"],
         "notes": "",
     }
