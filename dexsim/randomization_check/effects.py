@@ -1,6 +1,7 @@
 """What drawing a range by itself changes: in the draw or the compiled model, and then in motion and readings."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -78,13 +79,19 @@ def check(
     def run(episode: Episode) -> dict[str, np.ndarray]:
         return _run(env, step, dataclasses.replace(states, episode=episode), actions)
 
-    def draw(path: str, config: Any) -> Episode:
+    def draw(shape: str | None, config: Any) -> Episode:
         sampler = EpisodeSampler(config, env.hand, env.task, SensorSuite(config, env.hand, env.task))
         keys, objects = jax.random.split(key, (4, len(states.tick))), states.episode.object
-        if path in env.task.object_ranges:  # of a shape that has this range
-            shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(path.split(".")[-1].split("_")[0], "box")))
-            objects = jax.vmap(lambda one: env.task.sample_object(one, config, shape))(keys[3])
+        if shape is not None:
+            index = jnp.int32(SHAPES.index(shape))
+            objects = jax.vmap(lambda one: env.task.sample_object(one, config, index))(keys[3])
         return jax.vmap(sampler.sample)(keys[0], keys[1], keys[2], objects)
+
+    @functools.cache
+    def baseline(shape: str | None, config: Any) -> tuple[Episode, dict[str, np.ndarray]]:
+        """The draw without any width, which most ranges have in common, and its motion."""
+        episode = draw(shape, config)
+        return episode, run(episode)
 
     def effect(path: str) -> Effect:
         span = _at(env.config, path)
@@ -93,8 +100,11 @@ def check(
         config = perfect
         for aid, value in _AIDS.get(path, {}).items():
             config = _with(config, aid, value)
-        before, after = draw(path, config), draw(path, _with(config, path, span))
-        base = run(before)
+        shape = None
+        if path in env.task.object_ranges:  # of a shape that has this range
+            shape = _SHAPE_OF.get(path.split(".")[-1].split("_")[0], "box")
+        before, base = baseline(shape, config)
+        after = draw(shape, _with(config, path, span))
         size = {name: float(np.sqrt(np.mean(base[name] ** 2))) or 1.0 for name in READINGS}
         track = run(after)
         # Root mean square over hands and components, in the tick where it is largest.
