@@ -1,7 +1,6 @@
 """Observations: sizes, order and content of every field, the ablations, and bitwise sameness."""
 
 import dataclasses
-import types
 
 import jax
 import mujoco
@@ -10,7 +9,6 @@ import pytest
 
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.env.observer import Observer
 from dexsim.observation import (
     FIELDS,
     GRASP,
@@ -167,13 +165,6 @@ def test_the_critic_keeps_what_the_actor_goes_without(hand):
     assert critic == [*GRASP, "last_action"]
     with pytest.raises(ConfigError, match="'object_spin': no sensor measures it"):
         group_configs(ObservationConfig(add=("object_spin",)))
-
-
-def test_an_actor_that_is_left_nothing_is_refused(hand):
-    task = types.SimpleNamespace(name="mine", fields={"actor": ("contact_force",), "critic": ("contact_force",)})
-    config = types.SimpleNamespace(observation=ObservationConfig(leave_out=("contact_force",)))
-    with pytest.raises(ConfigError, match=r"leave_out = \('contact_force',\): removes every actor observation"):
-        Observer(config, hand, task)
 
 
 def test_every_reading_matters(hand, readings):

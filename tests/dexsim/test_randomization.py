@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from episodes import with_episode
 
-from dexsim.core.errors import ConfigError
 from dexsim.randomization import Randomization, sample_hand
 from dexsim.randomization_check.__main__ import conclude
 from dexsim.randomization_check.effects import check
@@ -173,21 +172,6 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
 
 
 # --- refusals ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("values", "word"),
-    [
-        ({"efficiency": (1.0, 0.8)}, "efficiency"),
-        ({"latency": (-0.1, 0.01)}, "latency"),
-        ({"scale": 3.0, "torque_factor": (0.5, 1.0)}, "torque_factor"),  # 1 - 1.5: a negative torque
-        ({"scale": 3.0, "gravity_tilt": 0.6}, "gravity_tilt"),
-        ({"beyond": 0.2}, "extremes"),
-    ],
-)
-def test_refusals(values, word):
-    with pytest.raises(ConfigError, match=word):
-        Randomization(**values)
 
 
 # --- the self-test -----------------------------------------------------------------------------------

@@ -103,22 +103,6 @@ def test_a_bad_mesh_is_an_error(word):
         mesh.load_mesh(bad_meshes()[word])
 
 
-def test_a_mesh_that_cuts_through_itself_cannot_be_signed():
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    overlapping = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.02, 0, 0))])
-    with pytest.raises(AssetError, match="cannot be signed"):
-        mesh.check_sign(mesh.load_mesh(overlapping))
-
-
-def test_a_hollow_ball_is_signed_right():
-    """A cavity: an inner surface with its normals toward the hollow."""
-    outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.03, 0.02))
-    hollow = mesh.load_mesh(trimesh.util.concatenate([outer, turned(inner)]))
-    mesh.check_sign(hollow)
-    value, _ = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
-    np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
-
-
 # --- grids ---------------------------------------------------------------------------------------
 
 SMOOTH = {"sphere": (0.03,), "capsule": (0.013, 0.025), "ellipsoid": (0.03, 0.02, 0.04)}

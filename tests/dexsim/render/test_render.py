@@ -1,8 +1,6 @@
 """The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
 
 import dataclasses
-import subprocess
-import sys
 import warnings
 from types import SimpleNamespace
 
@@ -25,7 +23,6 @@ SIZES = {
     "ellipsoid": [0.02, 0.03, 0.025],
 }
 SMALL = (320, 240)
-CAMERA = render.CAMERAS["grasp"]
 
 
 def primitives(*entries):
@@ -114,14 +111,6 @@ def test_nearer_occludes_farther_whatever_the_order():
     assert cast(primitives(near, far), view).depth[0, 0] == FAR
 
 
-def test_more_force_is_hotter():
-    force = np.linspace(0, 2, 50)
-    brightness = force_color(force, 2.0).astype(int) @ [299, 587, 114]
-    assert np.all(np.diff(brightness) >= 0) and brightness[-1] > 3 * brightness[0]
-    np.testing.assert_array_equal(force_color(np.array([2.0, 9.0]), 2.0)[0], force_color(np.array([9.0]), 2.0)[0])
-    assert force_color(np.array(np.nan), 1.0).shape == (3,)
-
-
 def cell_box(layout, finger, column, row):
     """Pixels (left, top, right, bottom; the last two exclusive) of one taxel's cell: the tip's row is at the top."""
     x, y = layout.slots[finger]
@@ -150,7 +139,7 @@ def test_heat_map_cell_lies_where_documented():
     assert image.shape == (12, 10) and image[0, 0] == 11 and image[11, 0] == 0 and image[11, 1] == 12
 
 
-@pytest.mark.parametrize("active", [*KINDS, None])
+@pytest.mark.parametrize("active", ["box", "ellipsoid", None])
 def test_frame_of_every_kind(hand, active):
     frame = render.render_frame(hand, KINDS, snapshot(hand, active=active), size=SMALL)
     assert frame.shape == (240, 320, 3) and frame.dtype == np.uint8
@@ -223,48 +212,3 @@ def test_mp4_is_written_and_readable(hand, tmp_path):
     reader.close()
     drawn = render.render_frame(hand, KINDS, jax.tree.map(lambda x: x[0], steps), size=SMALL, force_range=1.0)
     assert np.abs(first[:, :200] - drawn[:, :200]).mean() < 4  # what lossy compression leaves
-
-
-def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
-    from PIL import Image
-
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if not installed
-    env, steps = episode(hand, 9)
-    for rate, frames, duration in ((10, 3, 100), (60, 18, 20)):
-        path = render.render_episode(env, steps, tmp_path / "new" / "video.mp4", fps=30, size=(160, 120), rate=rate)
-        assert path == tmp_path / "new" / "video.gif"
-        with Image.open(path) as image:
-            assert image.n_frames <= frames and image.info["duration"] >= duration - 4
-            total = sum(image.seek(k) or image.info["duration"] for k in range(image.n_frames))
-        assert total == pytest.approx(300, abs=30 + 60 * (rate == 60))  # a GIF counts hundredths, and merges twins
-    empty = jax.tree.map(lambda x: x[:0], steps)
-    with pytest.raises(ValueError, match="no snapshots"):
-        render.render_episode(env, empty, tmp_path / "none.gif", fps=30)
-
-
-def test_rendering_needs_no_opengl_and_no_pyplot():
-    code = (
-        "import sys, dexsim.render.render as r; assert not {'matplotlib', 'PIL'} & set(sys.modules);"
-        "import numpy as np; from dexsim.render.panel import force_color; force_color(np.ones(1), 1.0);"
-        "bad = {'OpenGL', 'glfw', 'matplotlib.pyplot', 'pyglet', 'mujoco.egl', 'imageio_ffmpeg'} & set(sys.modules);"
-        "assert not bad, bad"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
-def test_a_film_that_fails_leaves_the_one_before_it(hand, tmp_path, monkeypatch):
-    ffmpeg, path = pytest.importorskip("imageio_ffmpeg"), tmp_path / "video.mp4"
-    path.write_text("the one before it")
-    env, steps = episode(hand, 3)
-    monkeypatch.setattr(ffmpeg, "write_frames", truncated)
-    with pytest.raises(OSError) as error:
-        render.render_episode(env, steps, path, fps=20, size=(160, 120))
-    assert "\n" not in str(error.value) and path.read_text() == "the one before it"
-    assert [other.name for other in tmp_path.iterdir()] == ["video.mp4"]
-
-
-def truncated(path, *_, **__):
-    """An encoder on a full disk, which says nothing."""
-    with open(path, "wb") as file:
-        while True:
-            file.write(b"ftyp" if (yield) is None else b"")

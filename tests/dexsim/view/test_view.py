@@ -4,8 +4,6 @@ import dataclasses
 import io
 import os
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -14,7 +12,6 @@ import numpy as np
 import pytest
 
 import dexsim
-from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
 from dexsim.render.picture import Pose
@@ -108,24 +105,6 @@ def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simu
     assert float(simulation._state.episode.object.friction) == pytest.approx(0.5 * float(before), rel=1e-5)
 
 
-def test_a_memory_lasts_as_long_as_the_episode_and_the_choice_of_its_policy(simulation, monkeypatch):
-    had = []
-
-    class Counts:
-        def initial_carry(self):
-            return 0
-
-        def act(self, carry, obs):
-            had.append(carry)
-            return carry + 1, np.zeros(12, np.float32)
-
-    policies = {"a": Counts(), "b": Counts(), NONE: None}
-    monkeypatch.setattr(simulation, "policies", policies)
-    for name in ("a", "a", "a", "reset", "a", "a", "b", "b", NONE, "b"):
-        simulation.reset(VALUES) if name == "reset" else run(simulation, 1, policy=name)
-    assert had == [0, 1, 2, 0, 1, 0, 1, 0]
-
-
 def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     simulation.reset(VALUES)
     frames = run(simulation, 120, policy=NONE, **{"push [m/s]": 2.0, "push": True})
@@ -134,19 +113,6 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     seconds = [float(frame.snapshot.seconds) for frame in frames]
     assert 20 < len([note for note in notes[first : first + 40] if note]) < 40
     assert min(seconds[first + 20 : first + 45]) < 0.1, "a new episode begins"
-
-
-def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
-    made = []
-    monkeypatch.setattr("dexsim.registry.make", lambda task, hand: made.append((task, hand.name)))
-    monkeypatch.setattr("dexsim.view.simulation.PolicyShelf", lambda env, first: made.append(first))
-    monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
-    open_source(ViewArguments(what="grasp", hand="inspire_like"))
-    assert made == [("grasp", "inspire_like"), NONE]
-    with pytest.raises(AssetError, match="no shipped hand has that name"):
-        open_source(ViewArguments(what="grasp", hand="no_such_hand"))
-    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
-        open_source(ViewArguments(what="no_such_thing"))
 
 
 @pytest.mark.slow
@@ -182,23 +148,6 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
     assert frames[0].kinds == () and source.controls()["go to [s]"].high == pytest.approx(0.6, abs=0.2)
     late = source.reset({"go to [s]": 0.3}).snapshot
     assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
-
-
-def test_view_names_the_missing_extra_before_it_imports_jax():
-    """What takes seconds comes after it: neither JAX nor MuJoCo is imported by then."""
-    code = """
-import sys
-sys.modules["viser"] = None
-from dexsim.__main__ import main
-try:
-    main(["view", "grasp"])
-except Exception as error:
-    print(error)
-print(sorted({"jax", "mujoco"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    said, imported = done.stdout.splitlines()
-    assert "pip install -e '.[view]'" in said and imported == "[]", done.stderr
 
 
 # --- the page -------------------------------------------------------------------------------------------
@@ -238,6 +187,7 @@ def wait_until(condition, seconds=25.0):
     return met
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_hand(page):
     from PIL import Image
 
@@ -248,6 +198,7 @@ def test_the_page_shows_the_hand(page):
     assert wait_until(lambda: colors() > 200), "the canvas stays empty"
 
 
+@pytest.mark.slow
 def test_pause_and_step(page):
     page.viewer.paused.value = True
     time.sleep(0.5)

@@ -6,7 +6,6 @@ import pytest
 from tiny_env import TinyEnv
 
 pytest.importorskip("gymnasium")
-from dexsim.errors import ConfigError
 from dexsim.wrappers.gymnasium import GymVectorEnv
 
 
@@ -51,10 +50,3 @@ def test_seeds_repeat_and_without_one_the_numbers_go_on():
     first, again = env.reset(seed=5)[0], env.reset(seed=5)[0]
     np.testing.assert_array_equal(first, again)
     assert np.any(env.reset()[0] != first)
-
-
-def test_what_does_not_fit_is_one_line():
-    with pytest.raises(ConfigError, match="no observation group .eyes.: choose"):
-        GymVectorEnv(TinyEnv(), 2, "eyes")
-    with pytest.raises(ConfigError, match="reset the environment before"):
-        GymVectorEnv(TinyEnv(), 1).step(np.zeros((1, 1)))

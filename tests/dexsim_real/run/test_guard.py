@@ -11,16 +11,9 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand
 from pty_hand import QUICK
 
-from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.motors_off import PATIENCE
-from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.loop import LoopThread
 from dexsim_real.run import guard
 from dexsim_real.run.guard import Guard
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire.frames import empty_state
-from dexsim_real.wire.link import LinkCounts, Reply
 
 
 @pytest.fixture
@@ -66,61 +59,3 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer):
         assert guard._ANSWER + guard._MOMENT < 1.0, "s, on a machine that is not busy"
     finally:
         watched._process.kill()
-
-
-def test_the_exchange_thread_gives_the_signs_of_life(hand):
-    """Before every exchange, and once more with the time that turning the motors off may take."""
-    events = []
-
-    class Port:
-        counts = LinkCounts()
-
-        def exchange(self, command):
-            events.append("exchange")
-            time.sleep(0.001)
-
-        def close(self):
-            pass
-
-    safety = Safety(hand, SafetyConfig())
-    servo = LoopThread(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
-    servo.driven = True
-    servo.start()
-    while events.count("exchange") < 20:
-        time.sleep(0.001)
-    Port.exchange = lambda self, command: events.append("answered") or Reply(empty_state(), 0.0, 0.0, 1, 1)
-    servo.stop()
-    last = events.index(PATIENCE)
-    assert events[:last:2] == [0.0] * (last // 2) and set(events[1:last:2]) <= {"exchange"}
-    assert events[last + 1 :] == ["answered"]
-
-
-def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(peer, tmp_path, monkeypatch):
-    """What it prints is no word of the guard's, and has no reader once the runner is gone."""
-    (tmp_path / "loud_sdk.py").write_text(
-        "import sys\n"
-        "from dexsim_real.wire.serial_hand import SerialHand\n"
-        "print('SDK 1.0', flush=True)\n"
-        "opened = []\n"
-        "class Loud:\n"
-        "    def __init__(self, *given):\n"
-        "        self.hand = SerialHand(*given)\n"
-        "        self.counts, self.exchange = self.hand.counts, self.hand.exchange\n"
-        "    def connect(self):\n"
-        "        print('connecting', flush=True)\n"
-        "        if len(opened) < 2:\n"
-        "            sys.exit('not found')\n"
-        "        return self.hand.connect()\n"
-        "    def close(self):\n"
-        "        self.hand.close()\n"
-        "        raise RuntimeError('close failed')\n"
-        "def open_hand(config):\n"
-        "    opened.append(config)\n"
-        f"    return Loud({peer.port!r}, config)\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    armed = Guard("sdk:loud_sdk", QUICK)
-    armed.arm()
-    armed.dismiss(off=False)
-    assert armed._process.wait(10) == 0
-    assert peer.commands and not peer.on().any()
