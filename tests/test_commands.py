@@ -1,16 +1,9 @@
-"""Every option of every command: documented, and named in errors as it is typed."""
+"""Options of the commands: named in errors as they are typed; help without a device; what the catalogue lists."""
 
-import ast
-import dataclasses
-import functools
-import inspect
-import itertools
 import os
 import pkgutil
 import subprocess
 import sys
-import textwrap
-import typing
 
 import pytest
 from option_classes import OPTIONS
@@ -20,9 +13,6 @@ from dexsim.core.errors import ConfigError
 from dexsim.registry import TASKS
 from dexsim_ppo.train import TrainArguments, preset_arguments
 
-CASES = [(command, "") for command in OPTIONS if command != "dexsim_ppo.train"]
-CASES += [("dexsim_ppo.train", task) for task in ("grasp", "rotate")]
-
 
 def load(command, task):
     """The options class and its defaults, or None."""
@@ -30,58 +20,6 @@ def load(command, task):
         default = preset_arguments(task, TASKS[task].config(), "cpu")
         return TrainArguments[type(default.env)], default
     return pkgutil.resolve_name(OPTIONS[command][0]), None
-
-
-def owners(cls, default):
-    """The options class and those of its fields that are groups of options."""
-    yield cls
-    for field in dataclasses.fields(cls):
-        value = getattr(default, field.name) if default is not None else field.default
-        if value is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
-            value = field.default_factory()
-        if dataclasses.is_dataclass(value):
-            yield from owners(type(value), value)
-
-
-def leaves(hint):
-    """The plain types in an annotation: float and NoneType of `tuple[float, float] | None`."""
-    if typing.get_origin(hint) is typing.Literal:
-        return {type(value) for value in typing.get_args(hint)}
-    arguments = typing.get_args(hint)
-    return set().union(*map(leaves, arguments)) if arguments else {hint}
-
-
-@functools.cache
-def field_docs(cls):
-    """The docstring under each field of a dataclass, on one line."""
-    docs = {}
-    for base in reversed([c for c in cls.__mro__ if dataclasses.is_dataclass(c)]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
-        for field, after in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
-    return docs
-
-
-@pytest.mark.parametrize(("command", "task"), CASES)
-def test_every_option_says_what_it_is(command, task):
-    """A help text that stands alone; of a number its unit ("1": none) and range; what None means."""
-    lacking = []
-    cls, default = load(command, task)
-    for owner in owners(typing.get_origin(cls) or cls, default):
-        hints = typing.get_type_hints(owner)
-        for field in dataclasses.fields(owner):
-            text, kinds = field_docs(owner).get(field.name, ""), leaves(hints[field.name])
-            limits = [field.metadata.get(end) for end in ("low", "high")]
-            for lacks, what in (
-                (len(text) < 6 or not text.endswith("."), "help text that ends with a full stop"),
-                (kinds & {int, float} and not field.metadata.get("unit"), "unit"),
-                (kinds & {int, float} and limits == [None, None], "range"),
-                (type(None) in kinds and "None" not in text, "what None means"),
-            ):
-                if lacks:
-                    lacking.append(f"{owner.__name__}.{field.name}: {what}")
-    assert lacking == []
 
 
 def test_help_starts_no_device():

@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, headless and small, and have the outputs of a whole run with them."""
+"""The notebooks run from top to bottom, headless and small."""
 
 import ast
 import base64
@@ -10,8 +10,6 @@ import re
 import numpy as np
 import pytest
 from paths import ROOT
-
-from dexsim_ppo import load_policy
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
@@ -68,16 +66,8 @@ def check(name, notebook):
             assert float(value) == pytest.approx(float(truth), rel=0.1)
 
 
-@pytest.mark.parametrize("name", EXPECTED)
-def test_outputs_are_of_a_whole_run(name):
-    notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
-    check(name, notebook)
-
-
 def test_all_that_they_import_is_there():
-    """They run with the slow tests alone."""
+    """All but one run with the slow tests alone."""
     assert {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} == set(EXPECTED)
     found = 0
     for name in EXPECTED:
@@ -93,8 +83,9 @@ def test_all_that_they_import_is_there():
     assert found > 30
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize(
+    "name", ["hand_bridge", *(pytest.param(name, marks=pytest.mark.slow) for name in EXPECTED if name != "hand_bridge")]
+)
 def test_it_runs(name, monkeypatch):
     # The kernel is started with this process's environment; the inline backend is its own choice.
     monkeypatch.delenv("MPLBACKEND", raising=False)
@@ -111,9 +102,3 @@ def test_it_runs(name, monkeypatch):
     folder = {"metadata": {"path": str(ROOT / "notebooks")}}
     nbclient.NotebookClient(notebook, timeout=600, resources=folder).execute()
     check(name, notebook)
-
-
-def test_the_outputs_are_of_the_policy_that_is_shipped():
-    notebook = nbformat.read(ROOT / "notebooks" / "shipped_policies.ipynb", as_version=4)
-    printed = " ".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", []))
-    assert f"trained for {load_policy('grasp').training['env_steps']:,} environment steps" in printed

@@ -11,8 +11,7 @@ import sys
 import pytest
 from paths import ROOT
 
-from dexsim.__main__ import COMMANDS
-
+pytestmark = pytest.mark.slow
 pytest.importorskip("mkdocs_jupyter")
 pytest.importorskip("mkdocstrings_handlers.python")
 if not (ROOT / "mkdocs.yml").exists():
@@ -41,21 +40,11 @@ def text_of(site, page):
     return html.unescape(re.sub(r"<[^>]+>", "", (site / page / "index.html").read_text()))
 
 
-@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(site):
     page = (site / "reference" / "python" / "index.html").read_text()
     for package in ("dexsim", "dexsim_ppo", "dexsim_real"):
         for name in importlib.import_module(package).__all__:
             assert re.search(rf'id="{package}[\w.]*\.{name}"', page), f"{package}.{name}"
-
-
-@pytest.mark.slow
-def test_every_command_is_there_with_its_options(site):
-    text = text_of(site, "reference/commands")
-    for name, (module, _) in COMMANDS.items():
-        assert f"python -m {module.removesuffix('.__main__')}" in text, name
-    for option in ("--env.objects.friction", "--safety.speed", "--video-quality", "--emulated"):
-        assert option in text
 
 
 def test_the_experiment_log_has_every_record(site):

@@ -90,12 +90,6 @@ class TestResuming:
         report = json.loads((here / "stub" / "b" / "report.json").read_text())
         assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
-    def test_a_larger_budget_measures_anew_and_a_smaller_one_keeps(self, paper, here):
-        experiment, calls = stub(paper, training_seeds=0)
-        for name, count in (("smoke", 3), ("cpu", 6), ("smoke", 6), ("cpu", 6), ("gpu", 9)):
-            paper.command.run(experiment, paper.data.BUDGETS[name], here, here / "work")
-            assert len(calls) == count, name
-
     def test_another_setting_is_another_row(self, paper, here):
         experiment, calls = stub(paper, training_seeds=0)
         budget = paper.data.BUDGETS["cpu"]
@@ -170,29 +164,6 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
     assert len(paper.experiments.EXPERIMENTS["observations"].rows) == 7
 
 
-def test_observations_of_the_rows(paper):
-    """What each row's policy sees of touch and orientation."""
-    from dexsim import load_hand
-    from dexsim.observation import ROTATE, layout
-
-    hand = load_hand()
-    sizes = {}
-    for row in paper.experiments.EXPERIMENTS["observations_paper"].rows:
-        config = paper.measure.task_config(row).observation
-        fields = {entry.name: entry.size for entry in layout(hand, ROTATE, config)}
-        kept = (fields.get(name, 0) for name in ("contact_centre", "contact_force", "relative_orientation"))
-        sizes[row.name] = (*kept, config.weighting)
-    assert sizes == {
-        "full": (15, 5, 6, "force"),
-        "quaternion": (15, 5, 4, "force"),
-        "unweighted": (15, 5, 6, "none"),
-        "no_force": (15, 0, 6, "force"),
-        "centre_alone": (15, 0, 6, "none"),
-        "no_touch": (0, 0, 6, "force"),
-        "no_orientation": (15, 5, 0, "force"),
-    }
-
-
 # --- objects that no training has seen ------------------------------------------------------------------
 
 
@@ -207,27 +178,6 @@ class TestHeldOut:
 
 
 # --- tables ---------------------------------------------------------------------------------------------
-
-
-def test_rows_without_training_say_so(paper):
-    experiment = paper.experiments.EXPERIMENTS["observations_paper"]
-    lines = paper.tables.rotation(experiment, {})
-    assert len(lines) == 8 and {line[-1] for line in lines[1:]} == {"not trained yet"}
-    assert [line[1].split(" / ")[0] for line in lines[1:]] == ["25.1", "2.9", "12.2", "13.2", "7.5", "1.1", "11.2"]
-
-
-def test_reports_of_other_weights_do_not_count(paper, tmp_path):
-    """A newly shipped policy has no report until it is measured."""
-    experiment = paper.experiments.EXPERIMENTS["force"]
-    (row,) = experiment.rows
-    path = paper.data.report_path(tmp_path, experiment, row)
-    path.parent.mkdir(parents=True)
-    report = {"budget": "cpu", "seeds": {"0": {}}, "row": paper.data.settings_of(row)}
-    path.write_text(json.dumps(report))
-    assert paper.command.reports_of(experiment, tmp_path) == {row.name: report}
-    path.write_text(json.dumps(report | {"row": report["row"] | {"weights": "0" * 16}}))
-    assert paper.command.reports_of(experiment, tmp_path) == {}
-    assert paper.data.missing_seeds(experiment, row, paper.data.BUDGETS["cpu"], json.loads(path.read_text())) == [0]
 
 
 def test_committed_tables_agree_with_the_reports(paper):

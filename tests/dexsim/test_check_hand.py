@@ -73,11 +73,8 @@ def inward(line):
 # What is changed in the MJCF, the TOML or the lines of the taxel file; the check that fails, and what it says.
 BROKEN = {
     "no inertia": ("xml", '<inertial mass="0.0158240"', '<inertial mass="0"', "files load", "mass"),
-    "name twice": ("xml", '<site name="mid_tip"', '<site name="index_tip"', "files load", "repeated name 'index_tip'"),
-    "finger twice": ("toml", 'name = "ring"', 'name = "index"', "files load", "each with a name of its own"),
     "tip twice": ("toml", 'tip = "ring_tip"', 'tip = "mid_tip"', "files load", "'mid_tip' is on .* as another"),
     "millimetres": ("csv", scaled(1e3), None, "taxels are on the skin", r"mm away from its link: metres, in"),
-    "inches": ("csv", scaled(0.0254), None, "taxels are on the skin", r"mm inside its link"),
     "frame": ("csv", lifted, None, "taxels are on the skin", r"'thumb': taxel .* mm away from its link"),
     "normals": ("csv", inward, None, "taxels are on the skin", r"faces into its link: .*120 of 120"),
 }  # fmt: skip

@@ -36,24 +36,6 @@ def test_a_registered_task_is_made_by_name_with_its_annotated_configuration(hand
     assert registry.find_task("mine").config_class is GraspConfig
 
 
-class Nameless(Grasp):
-    """Has the name of the task that it is derived from."""
-
-    def __init__(self, config: GraspConfig, hand: dexsim.Hand):
-        super().__init__(config, hand)
-
-
-def test_a_task_must_have_a_name_by_which_its_policies_find_it(hand):
-    dexsim.register("nameless", Nameless)
-    with pytest.raises(ConfigError, match="Nameless has the name 'grasp', by which another task is registered"):
-        registry.make_task("nameless", hand)
-    dexsim.register("other", Mine)
-    with pytest.raises(ConfigError, match="Mine has the name 'mine', by which no task is registered; .*'other'"):
-        registry.make_task("other", hand)
-    dexsim.register("mine", Mine)
-    assert registry.make_task("other", hand).name == "mine", "one task may have several names, as rotate has"
-
-
 ODD = {
     "nothing of a task": (object(), "object: expected a subclass of dexsim.Task"),
     "one group": ({"fields": {"actor": ("command",)}}, "'mine': fields\\['critic'\\] is missing or empty"),

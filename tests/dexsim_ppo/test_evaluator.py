@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv
 
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo import evaluate, load_policy
+from dexsim_ppo import evaluate
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, summarize
@@ -51,20 +50,6 @@ def test_totals_are_those_of_the_series(policy):
     assert totals["task"] == {"lived": [32] * 8}
 
 
-def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
-    """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
-
-    def sizes(steps, **options):
-        arguments = evaluate.EvaluateArguments(policy="grasp", **options)
-        return evaluate.sizes(SimpleNamespace(evaluation_steps=steps), arguments)
-
-    numbers = [1024, 1024, 512, 384, 128, 64, 64]
-    assert [sizes(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [(number, 64) for number in numbers]
-    assert (sizes(290, episodes=3), sizes(290, episodes=3, chunk=2)) == ((3, 3), (3, 2))
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert sizes(4000) == (1024, 1024)
-
-
 @pytree_dataclass
 class Commanded:
     """What a film of `Commands` holds."""
@@ -94,21 +79,6 @@ def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_
     env.control_period, env.evaluation_steps = 0.5, 130
     _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)
     assert film["x"].shape == (2 * 120,)
-
-
-def test_outputs_that_would_surprise_are_errors_before_the_policy_is_loaded(tmp_path, monkeypatch):
-    load_policy("grasp").save(tmp_path / "policy.msgpack")
-    monkeypatch.setattr(evaluate, "load_policy", lambda *_, **__: pytest.fail("it went on"))
-    before = (tmp_path / "policy.msgpack").read_bytes()
-    name = str(tmp_path / "policy.msgpack")
-    for options, words in {
-        ("--output", "x.mp4", "--video", "./x.mp4"): "--video .*x.mp4: is the file of --output",
-        ("--output", name): f"--output {name}: is the policy",
-        ("--episodes", "2000000"): "EvaluateArguments.episodes = 2000000: must be between 0 and 1000000",
-    }.items():
-        with pytest.raises(ConfigError, match=f"^{words}"):
-            evaluate.main([name, *options])
-    assert (tmp_path / "policy.msgpack").read_bytes() == before
 
 
 def test_intervals_are_by_start():

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dexsim
 from dexsim.core.compilation import jit
@@ -17,6 +18,7 @@ from dexsim_ppo import load_policy
 WORLDS, CLOSING, HOLDING = 16, 40, 8  # control ticks
 
 
+@pytest.mark.slow
 def test_forces_at_the_default_step_are_those_at_1_ms():
     config = GraspConfig(release_delay=(0.0, 0.0))  # objects settle while hands close
     env, policy = dexsim.make("grasp", config, backend="c"), load_policy("grasp")

@@ -89,18 +89,6 @@ def test_load_names_what_is_wrong(file, tmp_path):
             checkpoint.load(path, **options)
 
 
-def test_restore_names_what_does_not_fit(file):
-    loaded = checkpoint.load(file, kind="train")
-    for change, word in (
-        ({"x": jnp.zeros((2, 4))}, r"\['x'\]: expected"),
-        ({"y": jnp.zeros(1)}, r"\['y'\] is missing"),
-    ):
-        with pytest.raises(CheckpointError, match=word):
-            checkpoint.restore(loaded, TREE | change)
-    with pytest.raises(CheckpointError, match=r"\['x'\] is not expected"):
-        checkpoint.restore(loaded, {k: v for k, v in TREE.items() if k != "x"})
-
-
 # --- policies -------------------------------------------------------------------------------------------
 
 
@@ -119,12 +107,9 @@ def test_policy_round_trip(policy, tmp_path):
     ("header", "arrays", "words"),
     [
         ({"control_rate": 1e9}, {}, "control_rate"),
-        ({"control_rate": "33"}, {}, "control_rate"),
         ({"spec": {"name": "a", "fields": [], "posture": [1e9]}}, {}, "posture"),
         ({"observation_layout": [["a", 2, None]]}, {}, "observation"),
-        ({}, {"kernel_1": np.zeros((3, 3), np.float32)}, "invalid policy"),
         ({}, {"kernel_0": np.full((3, 8), np.nan, np.float32)}, "not finite, or deviations"),
-        ({}, {"std": np.zeros(3, np.float32)}, "not finite, or deviations"),
     ],
 )
 def test_numbers_that_give_no_action_are_an_error(policy, tmp_path, header, arrays, words):

@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from episodes import reset_to
-from remembering import remembering
 
 import dexsim
 import dexsim_ppo
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
-from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.core.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
@@ -75,17 +74,6 @@ def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
     np.testing.assert_array_equal(policy.ablate().act(None, obs)[1], full(obs))
     with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
         policy.ablate("colour")
-
-
-def test_an_ablated_memory_takes_the_mean_as_well():
-    policy = remembering()
-    hidden = np.concatenate([np.full(f.size, f.name == "contact_force") for f in policy.observation_layout])
-    obs = np.random.default_rng(0).normal(size=(4, 20, 66)).astype(np.float32)
-    ablated, mean = policy.ablate("contact_force"), np.asarray(policy.params.normalizer.mean)
-    one, other = policy.initial_carry(20), policy.initial_carry(20)
-    for x in obs:
-        (one, action), (other, wanted) = ablated.act(one, x), policy.act(other, np.where(hidden, mean, x))
-        np.testing.assert_allclose(action, wanted, atol=2e-5)
 
 
 WORLDS = 8
@@ -152,10 +140,8 @@ def test_the_rotation_policies_turn(name):
 
 MISUSE = {
     "no carry": ("grasp", lambda p, obs: p.act(None, obs), r"\(64,\).*None"),
-    "carry of a batch": ("grasp", lambda p, obs: p.act(p.initial_carry(8), obs), r"\(64,\).*\(8, 64\)"),
     "carry of another": ("rotate", lambda p, obs: p.act(np.zeros(64), obs), r"None.*\(64,\)"),
     "other observation": ("rotate", lambda p, obs: p.act(None, obs[:5]), r"65.*\(5,\)"),
-    "not the actor's part": ("grasp", lambda p, obs: p.act(p.initial_carry(), {"actor": obs}), r"66.*\(\)"),
 }
 
 
@@ -165,14 +151,3 @@ def test_misuse_is_named(what):
     policy = load_policy(name)
     with pytest.raises(ConfigError, match=words):
         use(policy, np.zeros(policy.params.normalizer.mean.size, np.float32))
-
-
-def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypatch):
-    """Such as one that `--lerobot grasp` wrote."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("grasp", "mine"):
-        (tmp_path / name).mkdir()
-    assert load_policy("grasp").task == "grasp"
-    for name, words in (("mine", "no such file"), ("./grasp", "cannot be read")):
-        with pytest.raises(CheckpointError, match=words):
-            load_policy(name)

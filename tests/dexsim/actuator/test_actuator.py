@@ -50,13 +50,6 @@ def random_drives(count, seed=0):
     return jax.tree.map(cast, drives), tuple(cast(x) for x in state)
 
 
-EXTRAS = ("ripple", "ripple_count", "ripple_phase", "encoder_bias", "coulomb_friction", "viscous_friction")
-
-
-def with_extras(drives, value):
-    return dataclasses.replace(drives, **dict.fromkeys(EXTRAS, value))
-
-
 def motor(**changes):
     values = dict(stiffness=3.0, damping=0.1, dead_band=0.0, stall_torque=1.1, no_load_speed=8.63, efficiency=1.0)
     return Actuator(**{name: jnp.float32(value) for name, value in {**values, **changes}.items()})
@@ -100,23 +93,6 @@ def test_a_delay_within_a_substep_is_the_mean_over_it():
 
 
 # --- ripple, encoder, friction ----------------------------------------------------------------------
-
-
-def test_parameters_that_are_zero_change_no_bit():
-    """What is not modelled and what is modelled with 0 give the same numbers, friction included."""
-    drives, state = random_drives(10_000, seed=2)
-    zeros = with_extras(drives, np.zeros(10_000, np.float32))
-    plain = np.asarray(drive(drives, *state))
-    np.testing.assert_array_equal(drive(zeros, *state), plain)
-    rate = np.float32(0.2)
-
-    @jax.jit
-    def net(drives, *state):
-        torque = actuator.drive(drives, *state)
-        return apply_friction(drives, torque, state[3], rate)
-
-    np.testing.assert_array_equal(net(zeros, *state), plain)
-    np.testing.assert_array_equal(net(drives, *state), plain)
 
 
 def test_ripple_is_a_wave_over_the_angle():

@@ -105,16 +105,6 @@ def test_the_description_fits_the_frames(hand, dataset):
     np.testing.assert_allclose(places["observation.tactile.ring"]["position"], hand.taxel_position[3], atol=1e-6)
 
 
-def test_refusals_are_one_line(hand, tmp_path, monkeypatch):
-    with pytest.raises(DexsimError, match="exists already"):
-        write_lerobot(tmp_path, hand, "grasp", [trajectory(3)])
-    with pytest.raises(DexsimError, match="no trajectory"):
-        write_lerobot(tmp_path / "new", hand, "grasp", [])
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(DexsimError, match=r"pip install -e '\.\[lerobot\]'"):
-        write_lerobot(tmp_path / "new", hand, "grasp", [trajectory(3)])
-
-
 def test_a_dataset_that_fails_leaves_nothing(hand, tmp_path, monkeypatch):
     """And until then there is nothing by its name, which a kill would leave."""
     names = []

@@ -103,9 +103,12 @@ def test_angles_come_in_steps_and_each_reading_has_its_own_noise(hand, read):
     noisy = dataclasses.replace(QUIET, joint_noise=0.01, torque_noise=0.02, object_noise=0.03, object_axes=(True,) * 3)
     plain = read(QUIET, now)
     reads = [read(noisy, now, key=key) for key in range(40)]
+    offs = []
     for name, size in (("joint_position", 0.01), ("joint_torque", 0.02)):
         off = np.array([getattr(r, name) - getattr(plain, name) for r in reads])
+        offs.append(off[:, 0])
         assert off.std() == pytest.approx(size, rel=0.15) and abs(np.corrcoef(off[:, 0], off[:, 1])[0, 1]) < 0.5
+    assert abs(np.corrcoef(offs)[0, 1]) < 0.5, "the torque's noise is not the angle's"
     place = np.array([r.object_position for r in reads]) - np.array([0.05, 0, 0.1])
     assert place.std() == pytest.approx(0.03, rel=0.25)
 

@@ -76,13 +76,6 @@ def test_changed_files_are_refused_or_warned_of(own):
         check_same(policy.hand, load_hand(), "the policy")
 
 
-def test_another_hand_is_refused(own):
-    replace(own, 'name = "pinky"\n', 'name = "little"\n')
-    replace("own/taxels.csv", "pinky,", "little,")
-    with pytest.raises(ConfigError, match="expected the hand 'xhand_right', got 'own/xhand_right.toml'"):
-        load_policy("grasp").find_hand(own)
-
-
 def test_run_keeps_its_hand(own, tmp_path):
     arguments = dataclasses.replace(default_arguments("grasp", "cpu", None), hand=own)
     hand = find_hand(arguments, None)

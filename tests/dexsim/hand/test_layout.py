@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from shapes import solid
 
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.core.errors import AssetError
 from dexsim.geometry import sdf
 from dexsim.geometry.mesh import load_mesh
 from dexsim.hand import layout
@@ -107,21 +107,3 @@ def test_taxels_inside_the_link_are_refused(hand):
     words = r"^tip: taxel column \d, row \d lies 2(\.0)? mm inside its link \(\d+ of 30\)$"
     with pytest.raises(AssetError, match=words):
         layout.check_outside(sunk, finger, name="tip")
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: layout.lattice(2, 2, pitch=0.002, kind="round"), "rect or hex"),
-        (
-            lambda: layout.on_surface("cone", layout.lattice(2, 2, pitch=0.002), radius=0.01),
-            "'cone': choose from plane",
-        ),
-        (lambda: layout.on_surface("cylinder", layout.lattice(20, 2, pitch=0.002), radius=0.005), "laps itself"),
-        (lambda: layout.on_surface("sphere", layout.lattice(2, 20, pitch=0.002), radius=0.01), "beyond the pole"),
-    ],
-)
-def test_refusals(make, words):
-    with pytest.raises(ConfigError, match=words) as caught:
-        make()
-    assert "\n" not in str(caught.value)

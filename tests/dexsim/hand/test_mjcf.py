@@ -81,16 +81,6 @@ def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15, err_msg=f"{name} {field}")
 
 
-def test_how_the_file_would_be_worked_out_is_not_for_the_scene(tmp_path):
-    """Gravity is the task's, tolerances are the configuration's, and contacts are not culled by MJX."""
-    own = """<option tolerance="0.1" ls_tolerance="0.9"><flag gravity="disable" sleep="enable"/></option>
-      <custom><numeric name="max_geom_pairs" data="2"/></custom><worldbody>"""
-    model, plain = (scene(load_hand(rewrite(tmp_path, *changes))) for changes in ([], [("<worldbody>", own)]))
-    for field in ("disableflags", "enableflags", "tolerance", "ls_tolerance"):
-        assert getattr(model.opt, field) == getattr(plain.opt, field), field
-    assert [plain.numeric(k).name for k in range(plain.nnumeric)] == ["max_contact_points"]
-
-
 def test_defaults_of_the_file_are_not_for_the_objects_contacts(tmp_path):
     """A margin would have them begin in the air, on a spring made for a depth."""
     defaults = '<default><pair margin="0.01" gap="0.002" solreffriction="0.01 1"/><geom density="2" quat="1 1 0 0"/>'

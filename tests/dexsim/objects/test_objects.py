@@ -181,7 +181,7 @@ def bounce(ratio, step=1e-5):
     return v
 
 
-@pytest.mark.parametrize("restitution", [0.03, 0.06, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("restitution", [0.03, 0.9])
 def test_damping_ratio_bounces_as_it_should(restitution):
     ratio = float(damping_ratio(jnp.float32(restitution)))
     assert bounce(ratio) == pytest.approx(restitution, rel=0.01)

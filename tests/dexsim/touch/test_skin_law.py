@@ -99,6 +99,7 @@ def test_it_follows_the_solvers_force(grips, shape):
     assert pearson(pairs) >= 0.9
 
 
+@pytest.mark.slow
 def test_no_finger_presses_unfelt(grips):
     """A fingertip that presses with half a newton or more compresses taxels (98 of 100)."""
     force, felt = np.concatenate([grips[shape][0].reshape(2, -1) for shape in SHAPES], axis=1)

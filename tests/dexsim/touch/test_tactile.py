@@ -106,7 +106,6 @@ def test_sphere_in_a_box_face(spacing, bound):
     ("cover", "depth"),
     [
         (0.0, [0.0006, 0, 0.0013]),
-        (-0.0007, [0.0, 0, 0.0006]),
         (-0.005, [0, 0, 0.0003]),
         (0.001, [0.0016, 0.0009, 0.0023]),
     ],
@@ -173,7 +172,7 @@ def test_a_finger_that_touches_nothing_reads_zero(hand, taxels):
             )[1]
         )
 
-    np.testing.assert_array_equal(jax.grad(total)(jnp.array([0.5, 0.0, 0.0])), 0)
+    np.testing.assert_array_equal(jax.jit(jax.grad(total))(jnp.array([0.5, 0.0, 0.0])), 0)
 
 
 # --- reduction -----------------------------------------------------------------------------------

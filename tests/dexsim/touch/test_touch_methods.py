@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from shapes import bake, solid
 
 from dexsim.core.errors import ConfigError
@@ -83,27 +81,6 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
 
 
 # --- materials -----------------------------------------------------------------------------------
-
-
-def slope(compression, c10, c01):
-    """Finite differences of the stress, in double precision and written anew."""
-
-    def stress(e):
-        stretch = 1 - e
-        return 2 * (stretch**-2 - stretch) * (c10 + c01 / stretch)
-
-    return (stress(compression + 1e-6) - stress(compression - 1e-6)) / 2e-6
-
-
-@given(st.floats(1e3, 1e6), st.floats(-0.9, 2.0), st.floats(0.05, 0.95))
-def test_a_skin_that_softens_is_refused(c10, ratio, compression):
-    c01 = ratio * c10
-    least = slope(np.linspace(0.0, compression, 500), c10, c01).min()
-    if least > 1e-3 * c10:
-        Skin(c10=c10, c01=c01, max_compression=compression)
-    elif least < -1e-3 * c10:
-        with pytest.raises(ConfigError, match="no positive stiffness at the max_compression"):
-            Skin(c10=c10, c01=c01, max_compression=compression)
 
 
 @pytest.mark.parametrize("name", MATERIALS)

@@ -15,7 +15,6 @@ import pytest
 
 import dexsim
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
 from dexsim.render.picture import Pose, hand_poses
@@ -109,24 +108,6 @@ def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simu
     assert float(simulation._state.episode.object.friction) == pytest.approx(0.5 * float(before), rel=1e-5)
 
 
-def test_a_memory_lasts_as_long_as_the_episode_and_the_choice_of_its_policy(simulation, monkeypatch):
-    had = []
-
-    class Counts:
-        def initial_carry(self):
-            return 0
-
-        def act(self, carry, obs):
-            had.append(carry)
-            return carry + 1, np.zeros(12, np.float32)
-
-    policies = {"a": Counts(), "b": Counts(), NONE: None}
-    monkeypatch.setattr(simulation, "policies", policies)
-    for name in ("a", "a", "a", "reset", "a", "a", "b", "b", NONE, "b"):
-        simulation.reset(VALUES) if name == "reset" else run(simulation, 1, policy=name)
-    assert had == [0, 1, 2, 0, 1, 0, 1, 0]
-
-
 def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     simulation.reset(VALUES)
     frames = run(simulation, 120, policy=NONE, **{"push [m/s]": 2.0, "push": True})
@@ -135,19 +116,6 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     seconds = [float(frame.snapshot.seconds) for frame in frames]
     assert 20 < len([note for note in notes[first : first + 40] if note]) < 40
     assert min(seconds[first + 20 : first + 45]) < 0.1, "a new episode begins"
-
-
-def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
-    made = []
-    monkeypatch.setattr("dexsim.registry.make", lambda task, hand: made.append((task, hand.name)))
-    monkeypatch.setattr("dexsim.view.simulation.PolicyShelf", lambda env, first: made.append(first))
-    monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
-    open_source(ViewArguments(what="grasp", hand="inspire_like"))
-    assert made == [("grasp", "inspire_like"), NONE]
-    with pytest.raises(AssetError, match="no shipped hand has that name"):
-        open_source(ViewArguments(what="grasp", hand="no_such_hand"))
-    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
-        open_source(ViewArguments(what="no_such_thing"))
 
 
 @pytest.mark.slow
@@ -292,6 +260,7 @@ def wait_until(condition, seconds=25.0):
     return met
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_hand(page):
     from PIL import Image
 
@@ -302,6 +271,7 @@ def test_the_page_shows_the_hand(page):
     assert wait_until(lambda: colors() > 200), "the canvas stays empty"
 
 
+@pytest.mark.slow
 def test_pause_and_step(page):
     page.viewer.paused.value = True
     time.sleep(0.5)

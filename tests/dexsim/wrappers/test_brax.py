@@ -1,6 +1,5 @@
 """The brax adapter, against the installed brax: its wrappers and its PPO."""
 
-import dataclasses
 import functools
 
 import jax
@@ -11,12 +10,10 @@ from simple_physics import SimplePhysics
 from tiny_env import TinyConfig, TinyEnv
 
 import dexsim
-from dexsim.core.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
 
 pytest.importorskip("brax")
 
-from brax.envs.wrappers import training
 
 from dexsim.wrappers.brax import BraxEnv, wrap
 
@@ -41,19 +38,6 @@ def run(env, actions):
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 
-def test_sizes_and_groups():
-    env = BraxEnv(tiny())
-    assert env.observation_size == {"actor": (3,), "critic": (3,)}
-    assert (env.action_size, env.backend, env.episode_length) == (1, "mjx", 32)
-    state = env.reset(jax.random.PRNGKey(0))
-    assert {group: obs.shape for group, obs in state.obs.items()} == env.observation_size
-    assert set(state.metrics) == {"error", "success"}
-    actor = BraxEnv(tiny(), "actor")
-    assert actor.observation_size == 3 and actor.reset(jax.random.PRNGKey(0)).obs.shape == (3,)
-    with pytest.raises(ConfigError, match="actor, critic"):
-        BraxEnv(tiny(), "camera")
-
-
 def test_step_is_ours():
     ours, env = tiny(), BraxEnv(tiny())
     state, want = env.reset(jax.random.PRNGKey(3)), ours.reset(jax.random.key(3))
@@ -75,25 +59,6 @@ def test_terminated_and_truncated_apart():
     assert states.info["steps"][:7, 1].tolist() == [1, 2, 3, 4, 5, 6, 1]
     starts = states.obs["actor"][stayed, 1, 0]
     assert len(set(starts.tolist())) == 2 and (np.abs(starts) <= 1.0).all()
-
-
-def test_termination_wins_over_truncation():
-    class Both(TinyEnv):
-        def step(self, state, action):
-            state = super().step(state, action)
-            return dataclasses.replace(state, terminated=state.truncated)
-
-    states = run(wrap(BraxEnv(Both(tiny().config)), episode_length=100), jnp.zeros((2, 1)))
-    assert states.done[5].all() and not states.info["truncation"].any()
-
-
-def test_standard_wrappers():
-    env = training.wrap(BraxEnv(tiny()), episode_length=6)
-    states = run(env, jnp.array([[1.0], [0.0]]))
-    stayed = np.flatnonzero(states.done[:, 1])
-    assert stayed.tolist() == [5, 11] and states.info["truncation"][stayed, 1].all()
-    # Each environment goes back to its own first state, as brax does it.
-    assert len(set(states.obs["actor"][stayed, 1, 0].tolist())) == 1
 
 
 def train(env, num_timesteps, **options):

@@ -77,11 +77,6 @@ def test_make_train_adapts_and_leaves_complete_environments_alone():
         adapt({}, "nothing")
 
 
-def test_float64_is_an_error_before_anything_is_compiled():
-    with jax.enable_x64(True), pytest.raises(ConfigError, match="unset JAX_ENABLE_X64"):
-        make_train(Reach(), SMALL)
-
-
 @pytest.mark.slow
 def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, capsys):
     config = dataclasses.replace(SMALL, num_envs=16)

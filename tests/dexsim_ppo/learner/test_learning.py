@@ -111,9 +111,8 @@ class Keyed(TinyEnv):
         return choose(done, self._start(fresh_key), dataclasses.replace(state, key=key))
 
 
-@pytest.mark.parametrize("length, block", [(1, 1), (7, 7), (34, 2), (40, 10)])
-@pytest.mark.parametrize("share", [0.1, 1.0])
-def test_restarts_what_ended_and_nothing_else(length, block, share):
+@pytest.mark.parametrize("length, block", [(7, 7), (40, 10)])
+def test_restarts_what_ended_and_nothing_else(length, block, share=0.3):
     """Against a loop over environments and steps: who ended goes on from the start drawn for it last."""
     env, count = Keyed(), 5
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(length), count))

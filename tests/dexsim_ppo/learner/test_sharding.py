@@ -61,7 +61,6 @@ def test_two_devices_train_as_one(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "devices", "processes", "message"),
     [
-        ({}, 3, 1, "PPOConfig.num_envs = 16: must be a multiple of the 3 devices"),
         ({"num_envs": 12, "minibatches": 16, "memory": "none"}, 4, 1, "PPOConfig.minibatches = 16: leaves 6 rows each"),
         ({}, 5, 1, "TrainArguments.devices = 5: there are 4, in 1 processes"),
         ({}, 2, 2, "devices = 2: there are 4, in 2 processes"),  # one without a device would wait for ever

@@ -18,14 +18,18 @@ from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 
-@pytest.fixture(scope="module")
-def policy():
-    """The integrator solved."""
+def trained(calls):
     training = make_train(TinyEnv(), CONFIG)
     state = training.init(jax.random.key(0))
-    for _ in range(12):
+    for _ in range(calls):
         state, _ = training.step(state)
     return Policy.from_training(TinyEnv(), CONFIG, state)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    """The integrator, hardly trained."""
+    return trained(1)
 
 
 @pytest.fixture
@@ -69,9 +73,9 @@ def test_the_critic_learns_first_and_then_both(policy):
 
 
 @pytest.mark.slow
-def test_what_it_knows_survives_and_grows(policy):
+def test_what_it_knows_survives_and_grows():
     """On a weaker motor: better from the first iteration on than one from nothing, never worse, better at the end."""
-    env = TinyEnv(TinyConfig(gain=0.15))
+    env, policy = TinyEnv(TinyConfig(gain=0.15)), trained(12)
     config = dataclasses.replace(fine_tuning_config(policy, CONFIG), critic_first=200)
     _, training, state = started(policy, config, env)
     measure = evaluate.Evaluator(env, 256)

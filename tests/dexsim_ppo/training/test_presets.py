@@ -7,16 +7,14 @@ import jax.numpy as jnp
 import pytest
 from tiny_env import TinyEnv
 
-import dexsim
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo import train
-from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training import presets
 from dexsim_ppo.training.arguments import training_config
-from dexsim_ppo.training.presets import PRESETS, device_preset, find_preset, preset_arguments
+from dexsim_ppo.training.presets import device_preset, find_preset, preset_arguments
 
 
 @pytest.mark.parametrize(
@@ -87,20 +85,6 @@ def test_the_ranges_of_rotation_widen_after_five_goals_and_narrow_below_half_of_
     assert rules.start == 0.1
 
 
-def test_tasks_from_elsewhere_get_no_setting_of_ours():
-    """Pendulum: -847, -158 and -452 with the steps of our tasks on a CPU, after -153."""
-    for name in PRESETS:
-        ours = preset_arguments("grasp", GraspConfig(), name)
-        given, _ = train.parse_arguments(["--task", "reach_env:reach", "--preset", name])
-        default = PPOConfig()
-        for field in ("learning_rate", "discount", "kl_halving"):
-            assert getattr(given.ppo, field) == getattr(default, field)
-        assert given.ppo.kl_target == (0.5 if name != "gpu" else 1.0) * ours.ppo.kl_target
-        assert given.ppo == dataclasses.replace(PRESETS[name].ppo, memory="none") and not given.curriculum.on
-        assert training_config(given) is given.env, "extremes need ranges, which it has none of"
-    assert find_preset("tpu", "reach") is PRESETS["cpu"]
-
-
 def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
     """And no other training does, fine-tuning included: its policy knows the full ranges."""
     for name, task, widens in (("cpu", "rotate", True), ("cpu-large", "rotate", True), ("gpu", "rotate", False)):
@@ -110,5 +94,3 @@ def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
     assert not find_preset("cpu", "grasp").curriculum.on
     scratch, tuned = (train.default_arguments("rotate", "cpu", begun) for begun in (None, load_policy("rotate")))
     assert scratch.curriculum.on and not tuned.curriculum.on and not tuned.ppo.kl_halving
-    env = dexsim.make("rotate", RotateConfig(pool_size=8), backend="c")
-    assert scratch.curriculum.metric.removeprefix("episode/") in env.reset(jax.random.key(0)).metrics

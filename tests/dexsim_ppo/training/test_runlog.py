@@ -15,7 +15,7 @@ from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.policy import Policy, PolicyParams
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
-from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, progress_line, read_metrics
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_metrics
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -81,13 +81,3 @@ def test_a_resumed_log_goes_on_after_the_checkpoint_and_to_every_sink(tmp_path, 
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
     assert logged == [("kl", 0.5, 800), ({"kl": 0.5}, 800), "closed", "finished"], "over environment steps, and no NaN"
-
-
-def test_the_progress_line_shows_what_there_is():
-    row = {"iteration": 1180, "env_steps": 4_833_280, "env_steps_per_s": 18412.0, "seconds_left": 208.7}
-    row |= {"episode/return": 184.237, "episode/success": 0.981, "step/force_error": float("nan"), "kl": 0.00812}
-    line = progress_line(row | {"skipped_updates": 2.0, "bounded_rewards": 0.0})
-    assert line == (
-        "iteration 1180 | steps 4.83e+06 | steps/s 1.84e+04 | left 3.5 min | return 184.24 | success 98.1% | KL 0.0081 "
-        "| skipped updates 2"
-    )

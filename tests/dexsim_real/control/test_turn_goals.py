@@ -64,12 +64,3 @@ def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, c
     place = np.asarray(REFERENCE) + [0.0, 0.6 * off, 0.8 * off]
     goals.update(7.5, seen(math.pi / 2, place=place))
     assert goals.successes == counts and goals.times == [7.5] * counts
-
-
-def test_the_spin_is_smoothed_over_a_tenth_of_a_second():
-    """A spin of 3 rad/s that starts at once: a first-order filter over 0.1 s."""
-    goals, period = TurnGoals(TurnSpec(spin=2.0), REFERENCE), 0.01
-    goals.update(0.0, seen(0.0))
-    for k in range(1, 20):
-        goals.update(period * k, seen(3.0 * period * k))
-        assert goals._spin == pytest.approx(3.0 * (1 - (0.1 / (0.1 + period)) ** k), rel=1e-4)

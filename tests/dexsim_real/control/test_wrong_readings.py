@@ -1,8 +1,5 @@
 """Wrong readings of the hand: they are no measurements, and no command follows them."""
 
-import sys
-import threading
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -31,8 +28,7 @@ def bench(hand):
 
 
 @pytest.mark.parametrize("value", [1.3, -1.3, 1e30, 1.9, np.nan])
-@pytest.mark.parametrize("cycles", [1, 40])
-@pytest.mark.parametrize("hold", ["", UNSEEN])
+@pytest.mark.parametrize(("cycles", "hold"), [(1, ""), (40, UNSEEN)])
 def test_a_wrong_angle_moves_nothing(bench, value, cycles, hold):
     """For one cycle and for half a second; while the policy is in command, and in a hold."""
     true = bench.position.copy()
@@ -122,7 +118,7 @@ def fastest(hand):
 
 
 @WAYS
-@pytest.mark.parametrize("gap", [CYCLE, 0.03, 0.5])
+@pytest.mark.parametrize("gap", [CYCLE, 0.5])
 def test_away_from_its_commands_a_joint_moves_for_30_ms_at_most(hand, check, way, gap):
     """However long nothing was read: with the motors on nothing carries it farther."""
     room = 0.1 + fastest(hand) * min(gap, 0.03)
@@ -138,14 +134,6 @@ def test_toward_its_command_a_joint_moves_no_faster_than_it_can(hand, check, way
     assert "too far from 0.90 rad before" in check.judge(CYCLE, pose(START + way * (room + 0.02)), command)
     # The same angle is plausible once there was time to get there.
     assert check.judge(2 * CYCLE, pose(START + way * (room + 0.02)), command) == ""
-
-
-def test_a_moving_joint_is_plausible_up_to_its_speed(hand, check):
-    position, goal = pose(), np.asarray(hand.joint_upper)
-    check.follow(goal)
-    for k in range(1, 40):
-        position = np.minimum(position + hand.speed_limit * CYCLE, goal)
-        assert check.judge(k * CYCLE, position, goal) == ""
 
 
 @WAYS
@@ -168,8 +156,8 @@ def test_commands_explain_a_motion_since_the_last_reading_and_not_later(check, w
         assert check.judge(0.5 + k * CYCLE, pose(START + way * 0.5), pose())
 
 
-@pytest.mark.parametrize("apart", [0.049, 0.051, -0.049, -0.051])
-@pytest.mark.parametrize("at", [0, 5, 9])
+@pytest.mark.parametrize("apart", [0.049, 0.051, -0.051])
+@pytest.mark.parametrize("at", [0, 9])
 def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
     """With the motors off; wherever among the last ten the wrong one is, the pose is the median."""
     check = PoseCheck(hand)
@@ -259,33 +247,6 @@ def test_no_course_of_events_makes_a_command_jump(hand, steps):
         else:
             last = None
         bench.now += pause
-
-
-@settings(max_examples=10, deadline=None)
-@given(st.lists(st.one_of(st.just(np.nan), st.just(np.inf), st.floats(-2, 2, width=32)), min_size=2, max_size=6))
-def test_a_second_thread_that_writes_any_target_puts_nothing_wrong_on_the_wire(hand, targets):
-    bench, sensing, stop = Bench(hand), HandSensing(hand, HardwareConfig()), threading.Event()
-    bench.engage()
-
-    def write():
-        while not stop.is_set():
-            for target in targets:
-                bench.safety.set_target(np.full(12, target), bench.now)
-
-    before, thread = sys.getswitchinterval(), threading.Thread(target=write)
-    sys.setswitchinterval(1e-6)
-    thread.start()
-    try:
-        sent = []
-        for _ in range(200):
-            decision = bench.cycle()
-            sent.append(sensing.command(decision.position, decision.mode)["position"])
-    finally:
-        stop.set()
-        thread.join()
-        sys.setswitchinterval(before)
-    assert np.isfinite(sent).all()
-    assert np.abs(np.diff(sent, axis=0)).max() <= 8.0 * CYCLE + 1e-5
 
 
 def test_a_command_that_is_not_finite_never_leaves(hand):

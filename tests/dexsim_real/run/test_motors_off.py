@@ -100,6 +100,7 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
     assert summary(tmp_path)["motors_off"]
 
 
+@pytest.mark.slow
 def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
     with FollowingHand() as peer:
         process = runner(peer, tmp_path, "--no-guard")
@@ -136,7 +137,7 @@ def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
         assert not turn_off(Failing([answer]), passive_command(), 0.05)
 
 
-@pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("way", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_the_guard_stops_the_hand_of_a_runner_that_was_killed_or_suspended(tmp_path, way):
     with moving(tmp_path, "--no-guard") as (peer, process):
         process.send_signal(way)
@@ -156,20 +157,3 @@ def test_the_guard_waits_for_a_cable():
         wait(lambda: len(peer.commands) > 0, 5.0)
         assert not peer.on().any()
         assert guard._process.wait(10) == 0
-
-
-@pytest.mark.parametrize(("leaving", "code"), [(True, 143), (False, -signal.SIGTERM)])
-def test_a_late_signal_does_not_change_how_an_interrupted_command_ends(leaving, code):
-    """It comes while the interpreter shuts down."""
-    script = f"""
-import os, signal, sys
-from dexsim_real.core.process import stopping
-try:
-    with stopping(leaving={leaving}):
-        os.kill(os.getpid(), signal.SIGTERM)
-except SystemExit as stop:
-    os.kill(os.getpid(), signal.SIGTERM)
-    sys.exit(stop.code)
-"""
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, timeout=60)
-    assert done.returncode == code

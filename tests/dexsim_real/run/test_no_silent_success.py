@@ -18,7 +18,6 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core import log
 from dexsim_real.core.log import LogWriter
-from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.run.session import Outcome
 from dexsim_real.sensors.camera import encode_mask
@@ -133,25 +132,3 @@ def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
         assert line == "the hand was held for 51 % of the run, last because: a joint is too fast"
     safety.refuse(Refusal("the hand reports busy", serious=False))
     assert missing(blind=50) == ["no measurement for 50 % of the run (the hand reports busy)"]
-
-
-def test_a_taxel_that_gets_stuck_does_not_end_the_grasp(tmp_path, capsys):
-    """It reads 25.5 N: above what a finger may press. The replay masks it at the same answer."""
-
-    def trouble(index, state):
-        state["tip"]["taxel"]["z"][3, 77] = 255 if index > 90 else 0
-        state["tip"]["taxel"]["z"][1, 5] = 250
-
-    with FollowingHand(trouble) as peer:
-        options = arguments(peer, tmp_path, "--seconds", "2")
-        assert run.main([option for option in options if option != "--quiet"]) == 0
-    shown = capsys.readouterr().err
-    for text in (
-        "index: stuck and read as 0 from now on: taxel column 0 row 5",
-        "ring: stuck and read as 0 from now on",
-    ):
-        assert f"warning: {text}" in shown
-    held = summary(tmp_path)["safety"].get("the fingertip force is too high", 0)
-    assert 10 < held < 40 and summary(tmp_path)["missing"] == []
-    again = replay.replay(tmp_path / "run.log").report
-    assert again["readings_same"] == again["ticks"] > 50 and again["first_difference"] is None

@@ -15,7 +15,6 @@ from dexsim_real.sensors.camera import (
     CameraConfig,
     HeightSensor,
     camera_axes,
-    colour_mask,
     encode_mask,
     height_of,
     open_masks,
@@ -57,18 +56,6 @@ def test_height_from_a_mask(height, yaw, pitch, focal):
     mask = picture(truth, config)
     # Half a pixel at half a metre and 600 px is 0.4 mm.
     assert height_of(mask, config, reference, 0) == pytest.approx(height, abs=6e-4)
-
-
-def test_masks_that_say_nothing():
-    config = CameraConfig()
-    reference = np.array([0.055, 0, 0.09])
-    assert height_of(np.zeros((480, 640), bool), config, reference, 0) is None
-    along = CameraConfig(position=(0.5, 0.0, 0.09), forward=(-1.0, 0, 0), down=(0, 0, -1.0))
-    assert height_of(picture((0.05, 0, 0.09), along), along, reference, 0) is None
-    with pytest.raises(HandError, match="parallel"):
-        CameraConfig(forward=(1.0, 0, 0), down=(1.0, 0, 0))
-    with pytest.raises(HandError, match="measures one"):
-        HeightSensor(lambda: None, config, reference, (True, True, False), 0.5)
 
 
 def test_velocity_is_filtered_as_in_the_simulation():
@@ -130,23 +117,10 @@ def test_a_camera_that_ends_or_fails_says_so():
         sensor.close()
 
 
-@pytest.mark.parametrize("when", [1.7e9 * 10, math.nan, math.inf])
+@pytest.mark.parametrize("when", [1.7e9 * 10, math.nan])
 def test_a_picture_of_another_clock_does_not_stay_young(when):
     config, reference = CameraConfig(), np.array([0.055, -0.005, 0.09])
     pictures = iter([(when, picture(reference, config)), None])
     sensor = HeightSensor(lambda: next(pictures), config, reference, (True, False, False), 0.5)
     assert until(lambda: sensor.has_measurement) and sensor.read()[0] <= time.monotonic()
     sensor.close()
-
-
-def test_the_colour_threshold():
-    cv2 = pytest.importorskip("cv2")
-    config = CameraConfig()
-    shown = picture((0.06, 0, 0.09), config, radius=30)
-    image = np.full((480, 640, 3), 60, np.uint8)
-    image[shown] = cv2.cvtColor(np.uint8([[[60, 200, 180]]]), cv2.COLOR_HSV2BGR)[0, 0]
-    image[5, 5] = image[shown][0]  # A speck.
-    mask = colour_mask(image, config)
-    assert not mask[5, 5] and (mask ^ shown).sum() < 0.05 * shown.sum()
-    with pytest.raises(HandError, match="cannot be opened"):
-        open_masks("/nowhere/film.mp4", config)

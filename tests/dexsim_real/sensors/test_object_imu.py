@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from dexsim.geometry import rotations
 from dexsim_real.core.errors import HandError
-from dexsim_real.run.options import RunArguments
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.sensors.object_sensors import ObjectSensors
@@ -114,11 +113,6 @@ def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():
         reader.receive(0.01 * tick, imu.encode(tick, quat_of(100 * (tick > 0), 0, 0)))
     reader.calibrate(IDENTITY)
     assert not reader.jumped and reader.read()[0] == pytest.approx(0.09)
-
-
-def test_a_mount_without_a_length_is_refused():
-    with pytest.raises(HandError, match=r"^--imu-mount 0 0 0 0: is no orientation \(w, x, y, z\)$"):
-        RunArguments(policy="rotate", port="", uncalibrated=True, imu_mount=(0.0, 0.0, 0.0, 0.0))
 
 
 def test_the_imu_thread_reads_a_port():

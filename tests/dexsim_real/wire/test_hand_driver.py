@@ -183,23 +183,6 @@ def test_a_line_that_never_falls_silent_does_not_hold_the_driver():
         thread.join()
 
 
-def test_a_port_that_fails_while_greeting_is_counted(monkeypatch):
-    def fail(*_):
-        raise OSError("unplugged")
-
-    with opened() as (_, port):
-        port.connect()
-        monkeypatch.setattr(port, "_wait", fail)
-        assert port.exchange(command()) is None
-        time.sleep(0.03)
-        assert port.exchange(command()) is None  # Opens again, and fails at once.
-        monkeypatch.undo()
-        time.sleep(0.1)
-        assert port.exchange(command()) is not None
-        assert (port.counts.lost, port.counts.reconnects) == (2, 1)
-        assert port.counts.sent == sum(outcomes(port.counts).values())
-
-
 def test_the_hand_goes_and_comes_back():
     peer = PtyHand()
     peer.open()

@@ -26,13 +26,9 @@ OURS = Identity("2R32A001", "right")
     ("serial", "side", "identity"),
     [
         (b"2R32A001" + bytes(24), b"right" + bytes(27), OURS),
-        (b"2R32A001", None, OURS),
         (b"2R32A001", b"L\0", Identity("2R32A001", "left")),
         (b"2L32A001", b"\1\0", Identity("2L32A001", "left")),
-        (b"A001", b"\1" + bytes(31), Identity("A001", "code 1")),
-        (None, b"R", Identity("", "right")),
         (b"\xff" * 32, None, Identity()),
-        (None, None, Identity()),
     ],
 )
 def test_what_a_hand_tells(serial, side, identity):
@@ -53,8 +49,6 @@ def calibration(hand, serial="2R32A001", handedness="right"):
         ),
         (None, ("2R32A001", "right"), "does not tell its serial number, and the calibration is of hand 2R32A001"),
         (Identity("2L32A001", "left"), None, "this is a left hand .* the model a right one"),
-        (Identity("2L32A001", "Left"), None, "this is a left hand"),
-        (Identity("A001", "code 1"), ("A001", "right"), "this hand is code 1, the calibration is of a right one"),
     ],
 )
 def test_another_hand_is_refused_in_one_line(hand, identity, known, says):
@@ -72,17 +66,6 @@ def test_the_hand_of_the_calibration_passes_and_what_is_unknown_is_told(hand):
         (note,) = check_identity(None, hand, known)
         assert "does not tell its serial number" in note
     assert "code 1" in check_identity(Identity("A001", "code 1"), hand, None)[0]
-
-
-def test_the_driver_asks_at_start():
-    with PtyHand(registers={20: b"right", 21: b"2R32A001"}) as peer:
-        port = SerialHand(peer.port, QUICK)
-        assert "right, serial number 2R32A001" in port.connect() and port.identity == OURS
-        port.close()
-    with PtyHand(registers={}) as peer:
-        port = SerialHand(peer.port, QUICK)
-        assert "serial number unknown" in port.connect() and port.identity == Identity()
-        port.close()
 
 
 @pytest.mark.parametrize(
