@@ -57,14 +57,11 @@ def mirror_start(start):
     return dataclasses.replace(start, qpos=qpos, object=mirrored)
 
 
-@pytest.mark.parametrize("name", ["grasp", pytest.param("rotate", marks=pytest.mark.slow)])
-def test_both_hands_do_the_same_in_the_mirror(hand, left, name):
+def test_both_hands_do_the_same_in_the_mirror(hand, left):
     """A closed loop of a shipped policy in C MuJoCo, with contacts: nominal hands, no pushes, no noise of sensors."""
-    policy = load_policy(name)
+    policy = load_policy("grasp")
     config = from_dict(find_task(policy.task).config_class, policy.env_config)
-    config = dataclasses.replace(config, pool_size=10, push_probability=0.0)
-    if name == "grasp":
-        config = dataclasses.replace(config, release_delay=(0.0, 0.0))
+    config = dataclasses.replace(config, pool_size=10, push_probability=0.0, release_delay=(0.0, 0.0))
     worlds = [dexsim.make(policy.task, config, backend="c", hand=one) for one in (hand, left)]
     start = jax.tree.map(lambda rows: rows[0], worlds[0].pool)
     runs = []
