@@ -125,8 +125,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         cli.check_writable(arguments.npz)
     cli.enable_caches()
     env = policy.make_env()
-    numbers = {"episodes": arguments.episodes, "seconds": arguments.seconds, "seed": arguments.seed}
-    trajectories, snapshots = record(policy, env, **numbers)
+    trajectories, snapshots = record(
+        policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed
+    )
     if arguments.lerobot:
         if arguments.pictures:
             pairs = zip(trajectories, snapshots, strict=True)

@@ -44,14 +44,14 @@ def write_episodes(path: Path, episodes: Episodes) -> None:
         "kinds": episodes.kinds,
         "lengths": [len(snapshot.joint_position) for snapshot in episodes.snapshots],
     }
-    arrays: dict[str, np.ndarray] = {"header": np.array(json.dumps(header))}
+    arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
     for field in dataclasses.fields(Snapshot):
         parts = [getattr(snapshot, field.name) for snapshot in episodes.snapshots]
         if parts[0] is not None:
             whole = np.concatenate(parts)
             arrays[field.name] = whole.astype(np.float16) if whole.dtype.kind == "f" else whole
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, **arrays)
     write_atomic(path, [buffer.getbuffer()])
 
 

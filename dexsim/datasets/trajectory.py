@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ class Trajectory:
         instants = np.arange(int(self.time[-1] * rate) + 1) / rate
         nearest = np.rint(np.interp(instants, self.time, np.arange(len(self.time)))).astype(int)
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        picked = {name: None if values is None else values[nearest] for name, values in fields.items()}
+        picked: dict[str, Any] = {name: None if values is None else values[nearest] for name, values in fields.items()}
         return Trajectory(**picked | {"time": instants})
 
 
