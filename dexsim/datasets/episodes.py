@@ -8,6 +8,7 @@ import dataclasses
 import io
 import json
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def read_episodes(path: Path, hand: str = "") -> Episodes:
         header = json.loads(str(arrays.pop("header")))
         arrays = {name: x.astype(np.float32) if x.dtype == np.float16 else x for name, x in arrays.items()}
         whole, ends = Snapshot(**arrays), np.cumsum(header["lengths"])
-        snapshots = [whole.map(lambda x, a=a, b=b: x[a:b]) for a, b in zip([0, *ends], ends, strict=False)]
+        snapshots = [whole.map(itemgetter(slice(a, b))) for a, b in zip([0, *ends], ends, strict=False)]
         task, period, kinds = header["task"], header["period"], tuple(header["kinds"])
     except (KeyError, TypeError, ValueError, EOFError) as error:
         raise DexsimError(f"{path}: no recorded episodes: {error}") from None
