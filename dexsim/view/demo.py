@@ -12,7 +12,7 @@ import tyro
 
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
-from dexsim.core.config import Config
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.view.__main__ import ViewArguments, show
 
@@ -23,9 +23,9 @@ class DemoArguments(Config):
 
     policy: Annotated[str, tyro.conf.Positional] = "grasp"
     """Name of a shipped policy."""
-    host: str = ViewArguments.host
+    host: str = "127.0.0.1"
     """Address to serve the page at."""
-    port: int = ViewArguments.port
+    port: int = setting(8080, unit="1", low=1, high=65535)
     """Port to serve the page at; the next free one if it is taken."""
 
 
