@@ -18,6 +18,7 @@ from dexsim.datasets.rerun import show_rerun
 from dexsim.datasets.trajectory import from_readings
 from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.controller import prepare_jax
+from dexsim_real.core.errors import HandError
 from dexsim_real.replay.replay import Replay, replay
 
 
@@ -38,6 +39,10 @@ class ReplayArguments:
     """The TOML of a hand of your own, where it is not in the place that the log names."""
     output: Path | None = None
     """JSON file for the report; None writes no file."""
+
+    def __post_init__(self):
+        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,9 +110,9 @@ def plot(run: Replay, path: Path) -> None:
             axis.plot(run.time, values["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
         axis.set_ylabel(f"{name} [rad]")
     axes[0].set_title("joint angles; targets dotted", loc="left")
-    units, labels = {"force": "N", "command": "0 to 1", "age": "s"}, {"force": hand.finger_names}
-    for axis, (signal, unit) in zip(axes[hand.num_fingers :], units.items(), strict=True):
-        axis.plot(run.time, values[signal], lw=0.8, label=labels.get(signal, signal))
+    others = {"force": hand.finger_names, "command": ["command"], "age": ["measurement"]}
+    for axis, (signal, names), unit in zip(axes[hand.num_fingers :], others.items(), ("N", "0 to 1", "s"), strict=True):
+        axis.plot(run.time, values[signal], lw=0.8, label=names)
         axis.set_ylabel(f"{signal} [{unit}]")
     for axis in axes:
         axis.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
