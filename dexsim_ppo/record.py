@@ -13,7 +13,6 @@ import io
 import operator
 import sys
 from collections.abc import Sequence
-from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -66,7 +65,7 @@ def record(
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
         rows = [{name: values[t, i] for name, values in readings.items()} for t in range(length)]
         trajectories.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
-        snapshots.append(shown.map(itemgetter((slice(length), i))))
+        snapshots.append(shown.map(operator.itemgetter((slice(length), i))))
     return trajectories, snapshots
 
 

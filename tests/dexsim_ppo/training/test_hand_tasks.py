@@ -8,6 +8,7 @@ import numpy as np
 
 import dexsim
 from dexsim.randomization import Randomization
+from dexsim.task_spec import TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.learner.ppo import make_train
@@ -49,7 +50,7 @@ def test_grasp():
 
 
 def test_rotate():
-    """An idle hand keeps the cube, which earns more than the first strokes do: these drop it."""
-    config = RotateConfig(pool_size=32, episode_seconds=3.0, randomization=NOMINAL)
-    idle, trained = train("rotate", config, 40)
-    assert np.nanmean(trained[-10:]) > np.nanmean(idle) + 4.0, (idle, trained)
+    """Goals half a radian apart, some of which 26,000 steps find. An idle hand reaches those that a start is near."""
+    config = RotateConfig(pool_size=32, episode_seconds=3.0, turn=TurnSpec(spin=2.0, step=0.5), randomization=NOMINAL)
+    idle, trained = train("rotate", config, 25)
+    assert np.nanmean(trained[-10:]) > np.nanmean(idle) + 40.0, (idle, trained)
