@@ -13,7 +13,9 @@ from scipy.special import stdtrit
 
 from dexsim.core.errors import CalibrationError
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
-from dexsim.identification.search import Search
+from dexsim.identification.search import CHI2, Search
+
+_LEAST_GROUPS = 3  # segments below which their differences are not part of an interval
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -49,6 +51,8 @@ class Identification:
     """[P, P], in the order of `fitted`; NaN for what the data do not tell."""
     latency: int
     """Sub-steps."""
+    latency_plausible: tuple[int, ...]
+    """Latencies that the data do not exclude."""
     timestep: float
     """s, of a sub-step."""
     unidentifiable: tuple[tuple[str, ...], ...]
@@ -75,7 +79,9 @@ class Identification:
             low, high = self.intervals[name]
             mark = " at its bound" if name in self.at_bound else ""
             rows.append(f"{name:18}{self.values[name]:12.5g}{low:12.5g}{high:12.5g}  {PARAMETERS[name].unit}{mark}")
-        rows.append(f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms")
+        others = ", ".join(str(lag) for lag in self.latency_plausible if lag != self.latency)
+        mark = f" (not excluded: {others})" if others else ""
+        rows.append(f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms{mark}")
         return "\n".join(rows + [f"note: {note}" for note in self.notes])
 
 
@@ -117,6 +123,12 @@ def identify(
     margin = 1e-3 * _size(search)
     at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
     at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
+    # All from the solution and with the weights found last: costs under other weights cannot be compared.
+    cost = {}
+    for search.latency in sorted(latencies):
+        cost[search.latency] = search.solve(theta, 10)[0]
+    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
+    plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")
     if holdout is not None:
         before, _ = evaluate(holdout, first, latency=latency, substeps=substeps)
@@ -124,15 +136,7 @@ def identify(
     rmse = np.sqrt(np.mean((residual.reshape(search.measured.shape) * search.noise[:, None]) ** 2, -1))
     notes = [MODEL, *(_GROUP.format(", ".join(group)) for group in unidentifiable)]
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
-    if len(latencies) > 1 and latency == max(latencies):
-        notes.append("latency is the largest that was tried: try more")
-    speed = np.gradient(log.position)
-    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
-        notes.append("the joint went one way only: friction and offsets are not apart")
-    if np.isfinite(after) and after > 0.9 * before:
-        notes.append(
-            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
-        )
+    notes += _notes(log, latency, latencies, plausible, before, after)
     return Identification(
         joint=log.name,
         values=values,
@@ -140,6 +144,7 @@ def identify(
         intervals=intervals,
         correlation=correlation,
         latency=latency,
+        latency_plausible=plausible,
         timestep=search.timestep,
         unidentifiable=unidentifiable,
         at_bound=at_bound,
@@ -171,8 +176,8 @@ def _intervals(
     half, correlation = half[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     least, largest = search.plausible()
-    low = np.maximum(np.minimum(theta - half, least), search.low[:count])
-    high = np.minimum(np.maximum(theta + half, largest), search.high[:count])
+    low = np.maximum(np.minimum(theta - half, least[:count]), search.low[:count])
+    high = np.minimum(np.maximum(theta + half, largest[:count]), search.high[:count])
     if search.dead_band is not None:
         first, last = search.dead_band_profile(search.dead_band)
         low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
@@ -186,13 +191,10 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
-    The wider of two intervals: of white noise, and by the jackknife over segments, one Newton step each: what the model
-    gets wrong differs from signal to signal, and residuals of one segment belong together.
-
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
       size: [P], what counts as a relative change of 1.
-      segment: [T] int, parts of the log that began at rest. Fewer than three are cut into ten of equal length.
+      segment: [T] int, parts of the log that began at rest; residuals of one part belong together.
 
     Returns:
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
@@ -203,23 +205,37 @@ def uncertainty(
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
     inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    white = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
-    spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    if len(np.unique(segment)) < 3:
-        segment = np.arange(len(segment)) * 10 // len(segment)
+    freedom = max(len(residual) - len(size), 1)
+    white = inverse * np.sum(residual**2) / freedom
     score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)
-    rows, moved = relative.reshape(-1, len(segment), len(size)), []
-    for part in (segment == k for k in np.unique(segment)):
-        rest = rows[:, ~part].reshape(-1, len(size))
-        moved.append(np.linalg.pinv(rest.T @ rest, rcond=_NULL**2, hermitian=True) @ score[part].sum(0))
-    count = len(moved)
-    between = stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
-    half = np.maximum(_NORMAL * spread, between) * size
+    robust = inverse @ _long_run(score) @ inverse * len(residual) / freedom
+    # Whichever is larger: the robust one is itself a guess and falls short in half of all cases.
+    half = _NORMAL * np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
+    half = np.maximum(half, _between_segments(relative, score, segment)) * size
+    spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
     correlation = white / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
+
+
+def _between_segments(relative: np.ndarray, score: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """Half of the 95 % intervals [P] by the jackknife over segments, one Newton step each.
+
+    What the model gets wrong differs from signal to signal, which no autocorrelation shows.
+    """
+    rows = relative.reshape(-1, len(segment), relative.shape[1])
+    parts = [np.einsum("ctp,ctq->pq", rows[:, segment == k], rows[:, segment == k]) for k in np.unique(segment)]
+    count, whole = len(parts), np.sum(parts, 0)
+    if count < _LEAST_GROUPS:
+        return np.zeros(len(whole))
+    scores = [score[segment == k].sum(0) for k in np.unique(segment)]
+    moved = [
+        np.linalg.pinv(whole - part, rcond=_NULL**2, hermitian=True) @ own
+        for part, own in zip(parts, scores, strict=True)
+    ]
+    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
 
 
 def _groups(
@@ -238,6 +254,25 @@ def _groups(
         elif vague:
             sets.append((first,))
     return tuple(dict.fromkeys(sets))
+
+
+def _notes(
+    log: JointLog, latency: int, latencies: tuple[int, ...], plausible: tuple[int, ...], before: float, after: float
+) -> list[str]:
+    notes = []
+    if len(latencies) > 1 and latency == max(latencies):
+        notes.append("latency is the largest that was tried: try more")
+    if latency not in plausible:
+        others = ", ".join(map(str, plausible))
+        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
+    speed = np.gradient(log.position)
+    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
+        notes.append("the joint went one way only: friction and offsets are not apart")
+    if np.isfinite(after) and after > 0.9 * before:
+        notes.append(
+            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
+        )
+    return notes
 
 
 def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> tuple[float, float]:
@@ -290,3 +325,26 @@ def check_log(log: JointLog) -> None:
         raise CalibrationError(
             f"{log.name}: torque sits at {size.max():.3g} Nm in most samples: saturated, give smaller commands"
         )
+
+
+def _long_run(score: np.ndarray) -> np.ndarray:
+    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T: Newey-West on the series without
+    its first-order autoregression (Andrews and Monahan 1992), bandwidth after Andrews 1991."""
+    count = len(score)
+    rho = _autocorrelation(score)
+    white = score[1:] - rho * score[:-1]
+    left = _autocorrelation(white)
+    alpha = float(np.max(4 * left**2 / ((1 - left) * (1 + left)) ** 2))
+    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)) + 1, count // 4)
+    total = white.T @ white
+    for lag in range(1, lags + 1):
+        cross = white[lag:].T @ white[:-lag]
+        total += (1.0 - lag / (lags + 1)) * (cross + cross.T)
+    return total / np.outer(1.0 - rho, 1.0 - rho) * count / (count - 1)
+
+
+def _autocorrelation(series: np.ndarray) -> np.ndarray:
+    """First-order coefficient [P] of each column, corrected for its bias in short series. Correlation over more than a
+    quarter of the series is not to be told from a trend."""
+    rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
+    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))

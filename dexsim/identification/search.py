@@ -1,7 +1,8 @@
 """The search of an identification: one log's least squares.
 
-Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Around it a scan over
-latencies (a whole number), and for a dead-band, which makes the cost rugged, `scipy.optimize.differential_evolution`.
+Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops without
+gradient: scans over latency (a whole number) and dead-band (a threshold), and a cross-entropy search, as a dead-band
+makes the cost rugged.
 """
 
 import functools
@@ -11,18 +12,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import differential_evolution, least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from dexsim.core.errors import CalibrationError
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 
 _BLUR = 2e-3  # rad, width of the dead-band's edges in the gradient
-_CHI2 = 3.84  # 95 %, one parameter
+CHI2 = 3.84  # 95 %, one parameter
 _THRESHOLD = 7.35  # 95 % for a threshold (Hansen 2000): the likelihood has a kink there
 _NOISE = (0.002, 0.02)  # rad, Nm: weights of angle and torque to begin with
-_CROWD, _GENERATIONS, _CLOUD = 64, 60, 512  # candidates of a generation; generations; candidates of a cloud
-_REACH = (40.0, 8.0)  # standard deviations that evolution reaches, at first and with the weights found
 
 # In the order of the arrays below: whatever is fitted, the compiled programs are the same.
 _NAMES = tuple(PARAMETERS)
@@ -121,6 +120,7 @@ class Search:
         self.measured = np.stack([log.position] if log.torque is None else [log.position, log.torque])
         self.noise = np.array(_NOISE)[: len(self.measured)]
         self.timestep, self.latency, self.best = log.period / substeps, 0, np.inf
+        self._seen: list[tuple[np.ndarray, np.ndarray]] = []  # candidates and their costs
         self._data = _Data(
             jnp.asarray(log.target, jnp.float32),
             jnp.asarray(self.measured, jnp.float32),
@@ -130,21 +130,13 @@ class Search:
         )
 
     def run(self, latencies: tuple[int, ...]) -> None:
-        """Fit once with the given weights, and once with those found: the noise that a fit leaves in each channel."""
+        """Fit once with the given weights, and once with those found."""
         self._scan_latencies(latencies)
-        if self.dead_band is not None:
-            self.best, theta = np.inf, self.theta
-            for width in np.linspace(*self.dead_band, 11):
-                self._attempt(np.append(theta[:-1], width), 5)
-        for reach in _REACH:
-            self._scan_latencies(tuple(lag for lag in latencies if abs(lag - self.latency) <= 1))
-            self.best = np.inf
-            self._attempt(self.theta, 30)
+        for fine in (False, True):
             if self.dead_band is not None:
-                self._attempt(self.theta, 30, with_band=True)
-                self._evolve(reach)
-            left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
-            self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
+                self._search_dead_band(self.dead_band, fine)
+            self._scan_latencies(tuple(lag for lag in latencies if abs(lag - self.latency) <= 1))
+            self._settle(last=fine)
 
     # --- the inner loop ---------------------------------------------------------------------------
 
@@ -212,58 +204,86 @@ class Search:
             costs[self.latency] = self._attempt(self.theta, 6)
         self.latency = min(costs, key=costs.__getitem__)
 
-    def _evolve(self, reach: float) -> None:
-        """Leave a valley by differential evolution, up to `reach` standard deviations around the present solution.
+    def _search_dead_band(self, span: tuple[float, float], fine: bool) -> None:
+        """Scan the range, or five values about the present one, then Brent's method."""
+        cell = (span[1] - span[0]) / 10
+        near = np.clip(self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
+        grid = near if fine else np.linspace(*span, 11)
+        self.best = np.inf
 
-        The joints start from the angles that were read: those of the solution have settled in the valley with it.
-        """
-        spread, starts, before = self._spread(), self.starts, self.best
-        self.starts = self._rests
+        def cost(width: float) -> float:
+            return self._attempt(np.append(self.theta[:-1], width), 5)
 
-        def costs(steps: np.ndarray) -> np.ndarray:
-            return self._costs(self.theta + steps.T @ spread)
-
-        result = differential_evolution(
-            costs,
-            [(-reach, reach)] * self.count,
-            x0=np.zeros(self.count),
-            vectorized=True,
-            updating="deferred",
-            popsize=_CROWD // self.count,
-            maxiter=_GENERATIONS,
-            polish=False,
-            seed=0,
+        at = int(np.argmin([cost(width) for width in grid]))
+        minimize_scalar(
+            cost,
+            method="bounded",
+            bounds=(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]),
+            options={"xatol": 2e-3 * (span[1] - span[0])},
         )
-        start = np.append(self._clip(self.theta + result.x @ spread), self.theta[self.count :])
-        if self._attempt(start, 20, with_band=True) >= before:
-            self.starts = starts
 
-    def _spread(self) -> np.ndarray:
-        """[P, P] steps in theta of one standard deviation each, along the axes of the valley."""
-        slope = self.jacobian(self.theta, self.starts)[:, : self.count] * self.scale[: self.count]
-        _, singular, axes = np.linalg.svd(slope, full_matrices=False)
-        return axes / np.maximum(singular, 1e-4 * singular[0])[:, None] * self.scale[: self.count]
+    def _settle(self, last: bool) -> None:
+        """Solve to the end, and take each channel's noise from what the fit leaves."""
+        self.best, with_band = np.inf, self.dead_band is not None
+        self._attempt(self.theta, 30)
+        if with_band:
+            self._attempt(self.theta, 30, with_band=True)
+        # Without a dead-band there is next to nothing to get lost in.
+        self._start_over(tries=(6 if last else 10) if with_band else 2)
+        if with_band and not last:
+            self._explore(rounds=6)
+        left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
+        self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
+        if last:
+            self.best = np.sum(self.residual(self.theta, self.starts) ** 2)
+            self._explore(rounds=14 if with_band else 3)
 
-    def _clip(self, theta: np.ndarray) -> np.ndarray:
-        return np.clip(theta, self.low[: self.count], self.high[: self.count])
+    def _start_over(self, tries: int) -> None:
+        """Solve again from about the present parameters and from the angles as they were read: a valley to which both
+        have settled together has no other way out."""
+        rng, best, starts = np.random.default_rng(1), self.theta, self.starts
+        for index in range(tries):
+            width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
+            theta = best + width * self.scale * rng.standard_normal(len(best))
+            theta[self.count :] = best[self.count :]
+            self.starts = self._rests
+            result = self.solve(np.clip(theta, self.low, self.high), 12, self.dead_band is not None)
+            if result[0] < self.best:
+                self.best, best, starts = result
+        self.theta, self.starts = best, starts
 
-    def _costs(self, thetas: np.ndarray) -> np.ndarray:
-        """Weighted sums of squares [N] for the fitted parameters [N, count], others and starts as they are."""
-        whole = np.tile(self.theta, (len(thetas), 1))
-        whole[:, : self.count] = self._clip(thetas)
-        weight = 1.0 / jnp.asarray(self.noise, jnp.float32)
-        return self._call(_crowd_costs, whole, self.starts, weight, far=np.inf)
+    def _explore(self, rounds: int, crowd: int = 256) -> None:
+        """Cross-entropy search about the present solution, which a gradient cannot leave: a
+        dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
+        count, scale = self.count, self.scale[: self.count]
+        slope = self.jacobian(self.theta, self.starts)[:, :count] * scale
+        middle = self.theta[:count] / scale
+        spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
+        rng, weight = np.random.default_rng(0), 1.0 / jnp.asarray(self.noise, jnp.float32)
+        self._seen = []
+        for _ in range(rounds):
+            tries = rng.multivariate_normal(middle, spread, crowd)
+            tries = np.clip(tries, self.low[:count] / scale, self.high[:count] / scale)
+            tries[0] = middle
+            thetas = np.tile(self.theta, (crowd, 1))
+            thetas[:, :count] = tries * scale
+            costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)
+            order = np.argsort(costs)
+            self._seen.append((thetas, costs))
+            elite = tries[order[: crowd // 8]]
+            middle, spread = elite[0], 2.0 * np.cov(elite.T) + 1e-12 * np.eye(count)
+            before = self.best
+            self._attempt(thetas[order[0]], 6, self.dead_band is not None)
+            if self.best < before:
+                middle = self.theta[:count] / scale
 
     # --- what fits as well ------------------------------------------------------------------------
 
     def plausible(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest [count] of each fitted parameter in a cloud of candidates that the data do not exclude."""
-        theta = self.theta[: self.count]
-        steps = np.random.default_rng(0).standard_normal((_CLOUD, self.count))
-        steps *= np.linspace(0.1, 4.0, _CLOUD)[:, None] / np.linalg.norm(steps, axis=1, keepdims=True)
-        thetas = self._clip(theta + steps @ self._spread())
+        """Least and largest of each parameter among all candidates that the data do not exclude."""
         limit = self._limit(np.sum(self.residual(self.theta, self.starts) ** 2), self.dead_band is not None)
-        within = np.concatenate([thetas[self._costs(thetas) <= limit], theta[None]])
+        thetas, costs = (np.concatenate(parts) for parts in zip(*self._seen, strict=True))
+        within = np.concatenate([thetas[costs <= limit], self.theta[None]])
         return within.min(0), within.max(0)
 
     def dead_band_profile(self, span: tuple[float, float]) -> tuple[float, float]:
@@ -282,4 +302,4 @@ class Search:
     def _limit(self, least: float, threshold: bool) -> float:
         """The largest sum of squares that the data do not exclude."""
         freedom = max(self.measured.size - len(self.theta), 1)
-        return least * (1 + (_THRESHOLD if threshold else _CHI2) / freedom)
+        return least * (1 + (_THRESHOLD if threshold else CHI2) / freedom)

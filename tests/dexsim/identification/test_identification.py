@@ -84,11 +84,23 @@ def recovered(seed):
 
 
 @pytest.mark.slow
-def test_parameters_come_back_in_nine_of_ten():
-    trials = [recovered(seed) for seed in range(100, 120)]
+def test_parameters_come_back_in_90_of_100():
+    trials = [recovered(seed) for seed in range(100, 200)]
     for name in trials[0][0]:
-        assert sum(inside[name] for inside, _ in trials) >= 17, name
-    assert sum(bool(wide) for _, wide in trials) <= 2
+        assert sum(inside[name] for inside, _ in trials) >= 90, name
+    assert sum(bool(wide) for _, wide in trials) <= 5
+
+
+@pytest.mark.slow
+def test_holdout_and_report():
+    holdout = log_of(TRUTH, 7, target=HOLDOUT)
+    result = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
+    assert result.holdout_rmse < 0.0013 and result.holdout_rmse_before > 0.003
+    direct = evaluate(holdout, result.values, latency=2, substeps=SUBSTEPS)
+    assert direct[0] == pytest.approx(result.holdout_rmse) and direct[1] < 0.02
+    for word in ("stiffness", "dead_band", "latency", "hold-out", "mrad"):
+        assert word in result.report()
+    np.testing.assert_allclose(np.diag(result.correlation), np.ones(6))
 
 
 @pytest.mark.parametrize("noise", [0.001, 2e-4])
@@ -96,7 +108,7 @@ def test_latency_scan_shows_its_valley(noise):
     """Also with less noise than the first weights say: costs under other weights would be too low by far."""
     log = log_of(FREE, 3, target=SHORT, latency=3, noise=noise)
     result = identify(log, GUESS, dead_band=None)
-    assert result.latency == 3
+    assert result.latency == 3 and result.latency_plausible == (3,)
 
 
 def c_log(truth, target, latency, timestep=5e-4, seed=0):
@@ -154,17 +166,6 @@ def group_with(result, *names):
     return any(set(names) <= set(group) for group in result.unidentifiable)
 
 
-def test_holdout_and_report(smooth_log):
-    holdout = log_of(FREE, 7, target=HOLDOUT)
-    result = identify(smooth_log, GUESS, latencies=(2,), dead_band=None, holdout=holdout)
-    assert result.holdout_rmse < 0.0013 and result.holdout_rmse_before > 0.003
-    direct = evaluate(holdout, result.values, latency=2, substeps=SUBSTEPS)
-    assert direct[0] == pytest.approx(result.holdout_rmse) and direct[1] < 0.02
-    for word in ("stiffness", "latency", "hold-out", "mrad"):
-        assert word in result.report()
-    np.testing.assert_allclose(np.diag(result.correlation), np.ones(5))
-
-
 def test_efficiency_is_lost_in_the_gains(smooth_log):
     result = quick(smooth_log, (*FIT, "efficiency"), GUESS | {"efficiency": 0.9})
     assert group_with(result, "stiffness", "damping", "stall_torque", "efficiency")
@@ -208,7 +209,8 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
     half, correlation, null = uncertainty(jacobian, residual, np.ones(3), one)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * np.sum(residual**2) / 397
     spread = np.sqrt(np.diag(covariance))
-    assert np.all(half / 1.96 >= 0.999 * spread) and np.all(half / 1.96 < 2.2 * spread)
+    assert np.all(half / 1.96 >= 0.999 * spread)
+    np.testing.assert_allclose(half / 1.96, spread, rtol=0.2)
     np.testing.assert_allclose(correlation, covariance / np.outer(spread, spread), atol=1e-9)
     assert not null
     twin = np.column_stack([jacobian, jacobian[:, 1]])
