@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
-from dexsim_real.control.alarms import joint_labels
+from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.loop import ExchangeLoop
@@ -256,3 +256,31 @@ def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand):
     assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
     held = [k for k, (reaction, _) in enumerate(decisions) if reaction == Reaction.HOLD]
     assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in decisions
+
+
+@pytest.mark.parametrize(
+    ("data", "serious", "text"),
+    [
+        ((1501028).to_bytes(4, "little"), True, "over-temperature (1501028)"),
+        ((1501035).to_bytes(4, "little") + b"\x04\x00", True, "over-current (1501035)"),
+        (b"\x1c\x00", True, "over-temperature (1501028)"),
+        (b"\x06", False, "busy (1501006)"),
+        (b"\xee\xee\xee\xee", False, "unknown error (ee ee ee ee)"),
+    ],
+)
+def test_an_error_frame_keeps_its_number(data, serious, text):
+    refusal = read_refusal(data)
+    assert refusal.serious == serious and text in refusal.text
+
+
+@pytest.mark.parametrize(("between", "fatal"), [("", True), ("busy", False), ("answer", False)])
+def test_only_serious_refusals_in_a_row_turn_the_motors_off(hand, between, fatal):
+    hot, alarms = read_refusal((1501028).to_bytes(4, "little")), Alarms(hand, SafetyConfig())
+    alarms.refuse(hot)
+    assert not alarms.fatal
+    if between == "busy":
+        alarms.refuse(read_refusal(b"\x06\x00"))
+    if between == "answer":
+        alarms.update(1.0, sample(1.0).measured, None)
+    alarms.refuse(hot)
+    assert bool(alarms.fatal) == fatal

@@ -1,5 +1,7 @@
 """Safety: every limit and its reaction, on both of its sides, over scripted and over random courses of events."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN
 from dexsim_real.control.safety import HandSample, Reaction, Safety
+from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
 
@@ -351,3 +354,22 @@ def test_a_reconnected_hand_starts_from_its_pose(bench, hold):
     first = bench.cycle(target=MIDDLE, hold=hold, generation=2, follow=False)
     np.testing.assert_allclose(first.position, bench.position, atol=0.7 * CYCLE)
     assert bench.safety.anchor == anchor + 1 and first.reason == (hold or first.reason)
+
+
+def test_a_margin_of_more_than_half_the_range_leaves_the_middle(hand):
+    """Limits that change sides would pull a joint away from where it was told to stay."""
+    half = np.min(hand.joint_upper - hand.joint_lower) / 2
+    bench = Bench(hand, margin=float(half) + 0.1)
+    bench.position = middle = ((hand.joint_lower + hand.joint_upper) / 2).astype(np.float32)
+    narrow = hand.joint_upper - hand.joint_lower < 2 * (half + 0.1)
+    bench.engage()
+    for way in (1, -1):
+        bench.run(2.0, target=middle + np.float32(way * 9.0))
+        np.testing.assert_allclose(bench.position[narrow], middle[narrow], atol=1e-5)
+
+
+def test_a_model_whose_joints_may_turn_for_ever_is_refused(hand):
+    """Its limits would limit nothing."""
+    for limit in (1e30, np.inf, np.nan):
+        with pytest.raises(HandError, match="a joint's limits are beyond a turn"):
+            Safety(dataclasses.replace(hand, joint_upper=np.full(12, limit)), SafetyConfig())

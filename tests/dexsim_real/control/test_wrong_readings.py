@@ -1,5 +1,8 @@
 """Wrong readings of the hand: they are no measurements, and no command follows them."""
 
+import sys
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -254,3 +257,30 @@ def test_a_command_that_is_not_finite_never_leaves(hand):
     for bad in (np.nan, np.inf, 1e300):
         with pytest.raises(HandError, match="not finite"), np.errstate(over="ignore"):
             sensing.command(np.full(12, bad), Mode.POSITION)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.one_of(st.just(np.nan), st.just(np.inf), st.floats(-2, 2, width=32)), min_size=2, max_size=6))
+def test_a_second_thread_that_writes_any_target_puts_nothing_wrong_on_the_wire(hand, targets):
+    bench, sensing, stop = Bench(hand), HandSensing(hand, HardwareConfig()), threading.Event()
+    bench.engage()
+
+    def write():
+        while not stop.is_set():
+            for target in targets:
+                bench.safety.set_target(np.full(12, target), bench.now)
+
+    before, thread = sys.getswitchinterval(), threading.Thread(target=write)
+    sys.setswitchinterval(1e-6)
+    thread.start()
+    try:
+        sent = []
+        for _ in range(200):
+            decision = bench.cycle()
+            sent.append(sensing.command(decision.position, decision.mode)["position"])
+    finally:
+        stop.set()
+        thread.join()
+        sys.setswitchinterval(before)
+    assert np.isfinite(sent).all()
+    assert np.abs(np.diff(sent, axis=0)).max() <= 8.0 * CYCLE + 1e-5

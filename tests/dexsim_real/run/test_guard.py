@@ -7,6 +7,14 @@ import time
 
 import pytest
 
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.motors_off import PATIENCE
+from dexsim_real.control.safety import Safety
+from dexsim_real.loop import LoopThread
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire.frames import empty_state
+from dexsim_real.wire.link import LinkCounts, Reply
+
 pytest.importorskip("serial")
 from following_hand import FollowingHand
 from pty_hand import QUICK
@@ -101,3 +109,30 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(p
     armed.dismiss(off=False)
     assert armed._process.wait(10) == 0
     assert peer.commands and not peer.on().any()
+
+
+def test_the_exchange_thread_gives_the_signs_of_life(hand):
+    """Before every exchange, and once more with the time that turning the motors off may take."""
+    events = []
+
+    class Port:
+        counts = LinkCounts()
+
+        def exchange(self, command):
+            events.append("exchange")
+            time.sleep(0.001)
+
+        def close(self):
+            pass
+
+    safety = Safety(hand, SafetyConfig())
+    servo = LoopThread(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
+    servo.driven = True
+    servo.start()
+    while events.count("exchange") < 20:
+        time.sleep(0.001)
+    Port.exchange = lambda self, command: events.append("answered") or Reply(empty_state(), 0.0, 0.0, 1, 1)
+    servo.stop()
+    last = events.index(PATIENCE)
+    assert events[:last:2] == [0.0] * (last // 2) and set(events[1:last:2]) <= {"exchange"}
+    assert events[last + 1 :] == ["answered"]
