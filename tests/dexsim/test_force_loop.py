@@ -7,9 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import dexsim
 from dexsim.force_loop import ForceLoop, commanded_force, correct_command
-from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
@@ -97,10 +95,7 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
     from dexsim_real.sensors.hand import HandMeasurement
     from dexsim_real.sensors.readings import ObjectEstimate
 
-    config = GraspConfig(pool_size=64)
-    hand = with_gains(hand, (8.0, 15.0, 13.0, 14.0, 15.0))
-    control = dataclasses.replace(config.control, force=dataclasses.replace(LOOP, gain=5.0))
-    env = dexsim.make("grasp", dataclasses.replace(config, control=control), hand=hand)
+    env = grasp_env
 
     class Close:
         task, spec, control_rate = env.name, env.spec, 1 / env.control_period

@@ -16,7 +16,7 @@ IDEAL = {"efficiency": 1.0} | dict.fromkeys(
 
 
 def motors(position, *, kp=100, torque_max=300, mode=Mode.POSITION):
-    return command_block(position, kp=kp, ki=0, kd=0, torque_max=torque_max, mode=mode)
+    return command_block(np.broadcast_to(position, 12), kp=kp, ki=0, kd=0, torque_max=torque_max, mode=mode)
 
 
 def drives(hand, heat=None, **overrides):
