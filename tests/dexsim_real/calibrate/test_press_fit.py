@@ -98,6 +98,7 @@ def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
     assert again.output.read_bytes() == options.output.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_press_is_taken_from_the_last_log_that_finished_it(hand, session, tmp_path):
     who = Operator(Console(file=io.StringIO(), width=200), stream=io.StringIO("s\n"))
     options = arguments(tmp_path, sides=False, yes=False)
