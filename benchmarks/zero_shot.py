@@ -219,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}; targets {TARGETS[task]}")
     print(table(here, there, idle))
     if pictures:
-        print(*draw_losses(pictures, load(policy, False)[0], reports), sep="\n")
+        print(*draw_losses(pictures, load(policy, False, options.get("hand", ""))[0], reports), sep="\n")
     return 0
 
 
