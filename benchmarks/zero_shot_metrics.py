@@ -83,7 +83,7 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
     """The metrics of a policy's trials, with a count of the causes of losses."""
     causes = Counter(r["end"].removeprefix("dropped: ") for r in reports if r["end"].startswith("dropped"))
     lost = {"lost": dict(causes.most_common())}
-    if task == "rotate":
+    if task != "grasp":
         return rotate_metrics(reports) | lost
     from dexsim_ppo.policy import load_policy
 

@@ -48,6 +48,7 @@ TASKS: dict[str, TaskEntry] = {
     "rotate": TaskEntry(rotate.RotateConfig, Rotate, rotate.RotateConfig),
     "rotate_paper": TaskEntry(rotate.RotateConfig, Rotate, rotate.paper),
     "rotate_without_orientation": TaskEntry(rotate.RotateConfig, Rotate, rotate.without_orientation),
+    "rotate_any": TaskEntry(rotate.RotateConfig, Rotate, rotate.any_object),
     "rotate_clear": TaskEntry(rotate.RotateConfig, Rotate, rotate.clear_of_palm),
 }
 _OURS = tuple(TASKS)

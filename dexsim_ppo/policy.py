@@ -188,7 +188,8 @@ class Policy(Config):
         layout = tuple(env.observation_layout["actor"])
         floor, clip = config.observation_std_floor, config.observation_clip
         normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)
-        params = PolicyParams(state.params.actor, normalizer, state.params.memory)
+        actor, memory = state.average
+        params = PolicyParams(actor, normalizer, memory)
         return cls(
             task=env.name,
             env_config=to_dict(env.config),

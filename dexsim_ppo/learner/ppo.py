@@ -101,6 +101,7 @@ def init_state(
     reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
+        average=(params.actor, params.memory),
         adam=adam.init(params),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
@@ -144,6 +145,7 @@ def train_iteration(
         env_state = jax.vmap(cast(Any, env).set_randomization_scale, (0, None))(env_state, scale)
     return TrainState(
         params=learner.params,
+        average=average_weights(state.average, learner.params, state.iteration),
         adam=learner.adam,
         learning_rate=learner.learning_rate,
         observation_stats=batch.observation_stats,
@@ -155,6 +157,13 @@ def train_iteration(
         scale=scale,
         carry=carry,
     ), metrics
+
+
+def average_weights(average: tuple, params: Params, iteration: jax.Array) -> tuple:
+    """Actor and memory averaged over about the last tenth of the iterations, so that no length has to be chosen
+    (polynomial-decay averaging, Shamir and Zhang 2013)."""
+    weight = 10.0 / (iteration.astype(jnp.float32) + 10.0)
+    return jax.tree.map(lambda old, new: old + weight * (new - old), average, (params.actor, params.memory))
 
 
 def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:

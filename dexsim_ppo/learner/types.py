@@ -8,7 +8,7 @@ import jax
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.adam import AdamState
-from dexsim_ppo.learner.networks import Params
+from dexsim_ppo.learner.networks import GRU, MLP, Params
 from dexsim_ppo.learner.running_stats import RunningStats
 
 
@@ -78,6 +78,8 @@ class TrainState:
     """All that training carries from one iteration to the next."""
 
     params: Params
+    average: tuple[MLP, GRU | None]
+    """Actor and memory, averaged over the last iterations: what a policy is made of."""
     adam: AdamState
     learning_rate: jax.Array  # []
     observation_stats: dict[str, RunningStats]

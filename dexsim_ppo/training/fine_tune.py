@@ -59,5 +59,6 @@ def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> Tra
     return dataclasses.replace(
         state,
         params=dataclasses.replace(state.params, actor=actor, memory=memory),
+        average=(actor, memory),
         observation_stats=state.observation_stats | {"actor": stats},
     )

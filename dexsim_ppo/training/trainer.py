@@ -115,8 +115,9 @@ class Run:
         if source:
             fresh, state = state, initialize_from(source, self.config, state)
             if self.mesh is not None:
-                learner = place((state.params, state.observation_stats), (fresh.params, fresh.observation_stats))
-                state = dataclasses.replace(state, params=learner[0], observation_stats=learner[1])
+                learned = lambda s: (s.params, s.average, s.observation_stats)  # noqa: E731
+                params, average, stats = place(learned(state), learned(fresh))
+                state = dataclasses.replace(state, params=params, average=average, observation_stats=stats)
         self._write_policy(self._policy(state), self.folder.untrained)
         return state
 

@@ -93,7 +93,7 @@ class Twin:
         self.imu: EmulatedImu | None = None
         self.masks: EmulatedCamera | None = None
         try:
-            if arguments.task == "rotate":
+            if arguments.task != "grasp":
                 self.imu = EmulatedImu(arguments.imu_link or folder / "imu", plant, seed=seed, start=self.start)
             else:
                 path = arguments.mask_socket or folder / "masks"

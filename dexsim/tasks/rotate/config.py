@@ -11,6 +11,7 @@ from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
+from dexsim.randomization import Randomization
 from dexsim.task_spec import TurnSpec
 from dexsim.touch.skin import Skin
 
@@ -59,6 +60,9 @@ class RotateConfig(EnvConfig):
     """From action to joint target."""
     edge: Range = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
     """Range of the edge of the cube that is turned, where `objects` has no mesh."""
+    proportions: Range = setting((1.0, 1.0), unit="1", low=0.2, high=5.0)
+    """Range of the factors on that edge along each axis of the object: a box in place of a cube. `objects.shapes` may
+    name cylinders, too; they stand on the palm."""
     turn: TurnSpec = setting(TurnSpec(spin=2.0))
     """Goals that follow one another about an axis, and when each is reached."""
     support: str = setting("palm", choices=("palm", "fingers"))
@@ -114,6 +118,11 @@ class RotateConfig(EnvConfig):
         super().__post_init__()
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
+        if other := set(self.objects.shapes) - {"box", "cylinder"}:
+            raise ConfigError(f"RotateConfig.objects.shapes names {sorted(other)[0]!r}: expected box or cylinder")
+        cubes = self.objects.shapes == ("box",) and self.proportions == (1.0, 1.0)
+        if not cubes and abs(self.turn.unit_axis[0]) < 1 - 1e-9:
+            raise ConfigError("RotateConfig.turn.axis: boxes and cylinders turn about the palm's normal, (1, 0, 0)")
 
     def placed_on(self, hand: Hand) -> "RotateConfig":
         """These settings in the palm frame of this hand."""
@@ -149,6 +158,20 @@ def paper() -> RotateConfig:
 def without_orientation() -> RotateConfig:
     """The paper's second policy: the object's orientation is not observed."""
     return RotateConfig(observation=ObservationConfig(leave_out=("relative_orientation",)))
+
+
+def any_object() -> RotateConfig:
+    """Boxes and cylinders of unknown size, whose orientation is not observed, on a palm that leans as much as 0.4 rad
+    either way from its nominal tilt."""
+    return RotateConfig(
+        objects=ObjectConfig(
+            shapes=("box", "cylinder"), mass=(0.06, 0.15), friction=(0.4, 1.2), link_friction=(0.3, 0.9)
+        ),
+        edge=(0.045, 0.065),
+        proportions=(0.9, 1.1),
+        randomization=Randomization(gravity_tilt=0.4),
+        observation=ObservationConfig(leave_out=("relative_orientation",), add=("joint_torque",)),
+    )
 
 
 def clear_of_palm() -> RotateConfig:

@@ -1,4 +1,4 @@
-"""What is turned: a cube, or a mesh."""
+"""What is turned: a cube, a box of three edges, an upright cylinder, or a mesh."""
 
 import dataclasses
 from typing import Any
@@ -10,20 +10,25 @@ import numpy as np
 from dexsim.core.pytree import Array
 from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.geometry import rotations
-from dexsim.objects.config import SHAPES
+from dexsim.objects.config import INACTIVE_SIZE, SHAPES
 from dexsim.objects.params import ObjectParams, extent, sample_object
 
+_Z_TO_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 CLEARANCE = 0.001  # m, smallest gap between palm and object with support "fingers"
 
 
 def slots(config: Any) -> tuple[str, ...]:
     """The primitives that the object consists of."""
-    return config.objects.slots if config.objects.mesh else ("box",)
+    return config.objects.slots
 
 
 def largest_size(config: Any) -> np.ndarray:
     """Upper bound [K, 3] m of each slot's size."""
-    return config.objects.largest if config.objects.mesh else np.full((1, 3), config.edge[1] / 2)
+    if config.objects.mesh:
+        return config.objects.largest
+    half = config.edge[1] / 2 * config.proportions[1]
+    size = {"box": [half, half, half], "cylinder": [half, half, 0.0]}
+    return np.array([size[slot] for slot in slots(config)])
 
 
 def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
@@ -31,20 +36,27 @@ def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
     if config.objects.mesh:
         return sample_object(key, config.objects)
     edge_key, base_key, scale_key = jax.random.split(key, 3)
-    base = sample_object(base_key, config.objects, jnp.int32(SHAPES.index("box")))
+    shape_key, proportion_key = jax.random.split(jax.random.fold_in(key, 1))
+    shapes = jnp.array([SHAPES.index(name) for name in config.objects.shapes], jnp.int32)
+    base = sample_object(base_key, config.objects, jax.random.choice(shape_key, shapes))
     extreme = sample_extreme(base_key, config.objects.extremes)  # the one that `sample_object` draws
     half = uniform(edge_key, config.edge, extreme) / 2
+    half = half * uniform(proportion_key, config.proportions, extreme, (3,))
     solid = base.mass * uniform(scale_key, config.objects.inertia_scale, extreme)
-    stand = upright(config.turn.unit_axis)
-    return dataclasses.replace(
+    stand, kinds = upright(config.turn.unit_axis), slots(config)
+    active = jnp.array([SHAPES.index(kind) for kind in kinds]) == base.shape_index
+    # Slots lie along the object's axes; the axis of a cylinder, z, is the palm's normal, x.
+    sizes = {"box": half, "cylinder": jnp.stack([half[1], half[0], jnp.zeros(())])}
+    turned = {"box": (1.0, 0.0, 0.0, 0.0) if stand is None else stand, "cylinder": _Z_TO_X}
+    object = dataclasses.replace(
         base,
-        size=jnp.full((1, 3), half),
-        position=jnp.zeros((1, 3)),
-        active=jnp.ones(1, bool),
-        inertia=solid * cube_inertia(half),
-        quat=None if stand is None else jnp.array([stand], jnp.float32),
-        kinds=("box",),
+        size=jnp.where(active[:, None], jnp.stack([sizes[kind] for kind in kinds]), INACTIVE_SIZE),
+        position=jnp.zeros((len(kinds), 3)),
+        active=active,
+        quat=None if kinds == ("box",) and stand is None else jnp.array([turned[kind] for kind in kinds], jnp.float32),
+        kinds=kinds,
     )
+    return dataclasses.replace(object, inertia=solid * solid_inertia(object))
 
 
 def upright(axis: np.ndarray) -> np.ndarray | None:
@@ -57,9 +69,15 @@ def upright(axis: np.ndarray) -> np.ndarray | None:
     return (half / np.linalg.norm(half)).astype(np.float32)
 
 
-def cube_inertia(half: jax.Array) -> jax.Array:
-    """Inertia [3] m^2 of a uniform cube of 1 kg, `half` m from its middle to its sides."""
-    return jnp.full(3, 2 / 3) * half**2
+def solid_inertia(object: ObjectParams) -> jax.Array:
+    """Inertia [3] m^2 about its axes of a uniform box, or cylinder along x, of 1 kg."""
+    squares = object.size**2
+    inertia = jnp.zeros(3)
+    for kind, (a, b, c), active in zip(object.kinds, squares, object.active, strict=True):
+        box = jnp.stack([b + c, a + c, a + b]) / 3
+        side = a / 4 + b / 3
+        inertia += jnp.where(active, box if kind == "box" else jnp.stack([a / 2, side, side]), 0.0)
+    return inertia
 
 
 def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Array:

@@ -29,11 +29,11 @@ from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
 from dexsim.tasks.rotate.objects import (
     CLEARANCE,
-    cube_inertia,
     largest_size,
     lowest_point,
     sample_turned_object,
     slots,
+    solid_inertia,
 )
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import load_pool
@@ -125,7 +125,7 @@ class Rotate(Task):
         self._placed = placed = config.placed_on(hand)
         self.turn = placed.turn
         self.slots, self.largest = slots(config), largest_size(config)
-        drawn = ("edge", *(f"objects.{name}" for name in PROPERTY_RANGES))
+        drawn = ("edge", "proportions", *(f"objects.{name}" for name in PROPERTY_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
@@ -151,7 +151,7 @@ class Rotate(Task):
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
         if self.config.objects.mesh:
             return params.unit_inertia(object, self.config.objects)
-        return cube_inertia(object.size[0, 0])
+        return solid_inertia(object)
 
     def begin(self, key: jax.Array | None, start: Start | None) -> RotateGoal:
         del key, start

@@ -16,7 +16,7 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.parameters import TrialParameters
+from dexsim_real.twin.plant.parameters import TrialParameters, skill_of
 from dexsim_real.twin.plant.scene import Scene
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, turn
 
@@ -42,6 +42,7 @@ class Start(NamedTuple):
 
 def start_of(hand: Hand, task: str) -> Start:
     """The start on the XHand, or of a grasp by the TOML of another hand. HandError: its TOML has no grasp."""
+    task = skill_of(task)
     if (hand.num_joints, hand.num_taxels) == (len(POSTURES[task]), 120):
         side = np.array([1.0, hand.thumb_side, 1.0])
         return Start(np.array(POSTURES[task]), np.array(REFERENCES[task]) * side, np.array(PLACES[task]) * side[1:])
@@ -99,7 +100,7 @@ def sample_place(
     parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, start: Start
 ) -> Place:
     """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
-    if parameters.task == "rotate":
+    if parameters.task != "grasp":
         quat = turn((1.0, 0.0, 0.0), parameters.heading_error * rng.uniform(-1, 1))
         shift = parameters.place_error * rng.uniform(-1, 1, 2)
         gap, speed = 0.0005, 0.0

@@ -25,6 +25,7 @@ from dexsim_real.twin.plant.parameters import (
     STRUCTURE,
     TrialParameters,
     sample_trial,
+    skill_of,
 )
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
@@ -162,7 +163,7 @@ class EmulatedHand:
         past = self._past_state(max(getattr(parameters, "imu_delay", 0.0) - IMU_TRANSPORT, 0.0))
         quat = past.qpos[at + 3 : at + 7].copy()
         specific_force = matrix(quat).T @ (past.acceleration - self._gravity)
-        if self.task != "rotate":
+        if self.task == "grasp":
             return position, quat, specific_force
         heading = turn(self.up, parameters.imu_drift * (self.time - self._began))
         error = parameters.imu_bias + parameters.imu_noise * rng.standard_normal(3)
@@ -363,7 +364,7 @@ class Pushes:
 
     def begin(self, time: float) -> None:
         """The object is free from a time in s."""
-        rate = PUSHES[self._parameters.task][0] * self._parameters.push_rate
+        rate = PUSHES[skill_of(self._parameters.task)][0] * self._parameters.push_rate
         self._at = time + self._rng.exponential(1 / rate) if rate > 0 else np.inf
 
     def apply(self, time: float, force: np.ndarray) -> None:
@@ -374,7 +375,7 @@ class Pushes:
             return
         parameters, duration = self._parameters, self._parameters.push_seconds
         direction = self._rng.standard_normal(3)
-        change = PUSHES[parameters.task][1] * self._rng.random() * direction / np.linalg.norm(direction)
+        change = PUSHES[skill_of(parameters.task)][1] * self._rng.random() * direction / np.linalg.norm(direction)
         force[:] = parameters.mass * change / duration
         self._until = time + duration
         self.begin(time)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dexsim_real.twin.plant.assistant import REFERENCES
+from dexsim_real.twin.plant.parameters import skill_of
 from dexsim_real.twin.plant.shapes import matrix, product, turn
 
 LIMITS = {"grasp": 8.0, "rotate": 120.0}
@@ -68,6 +69,7 @@ class Referee:
         fingers: int = 5,
         thumb_side: float = 1.0,
     ):
+        task = skill_of(task)
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count

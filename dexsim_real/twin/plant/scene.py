@@ -27,6 +27,7 @@ KINDS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "disc": mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
 
 
@@ -102,9 +103,10 @@ def add_object(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
     body.add_freejoint(name="object")
     for k, part in enumerate(shape.parts):
         size = [*part.size, 0.0, 0.0][:3]
-        body.add_geom(
-            name=f"object_{k}", type=KINDS[part.kind], size=size, pos=part.place, contype=0, conaffinity=0, density=1.0
-        )
+        geom = body.add_geom(name=f"object_{k}", type=KINDS[part.kind], size=size, pos=part.place, density=1.0)
+        geom.contype = geom.conaffinity = 0
+        if part.kind == "disc":
+            geom.quat = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # z to x
 
 
 def set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:

@@ -18,13 +18,15 @@ BODY_SHARE = 0.8  # size of a composition's body relative to a single body
 class Primitive:
     """A primitive, aligned with the object's axes."""
 
-    kind: str  # "sphere", "box", "cylinder", "capsule"
+    kind: str  # "sphere", "box", "cylinder", "capsule"; "disc": a cylinder along x
     size: tuple[float, ...]  # m: radius; half extents; radius, half length
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, centre in the object's frame
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [...] m of points [..., 3] in the object's frame, negative inside."""
         local = points - self.place
+        if self.kind == "disc":
+            return Primitive("cylinder", self.size).distance(local[..., ::-1])
         x, y, z = np.moveaxis(local, -1, 0)
         if self.kind in ("sphere", "capsule"):
             half = self.size[1] if self.kind == "capsule" else 0.0
@@ -38,9 +40,11 @@ class Primitive:
     def reach(self, direction: np.ndarray) -> float:
         """Extent in m from the object's origin along a unit direction [3] of its frame."""
         x, y, z = np.abs(direction)
+        if self.kind == "disc":
+            x, z = z, x
         if self.kind == "box":
             extent = np.dot(self.size, (x, y, z))
-        elif self.kind == "cylinder":
+        elif self.kind in ("cylinder", "disc"):
             extent = self.size[0] * np.hypot(x, y) + self.size[1] * z
         else:
             extent = self.size[0] + (self.size[1] * z if self.kind == "capsule" else 0.0)
@@ -64,11 +68,17 @@ class ObjectShape:
 
 
 def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: str | None = None) -> ObjectShape:
-    """Sample the object of a trial: a cube to rotate; to grasp, one of `SHAPES`, or the named one."""
+    """Sample the object of a trial: a cube to rotate, or a box or upright cylinder; to grasp, one of `SHAPES`, or
+    the named one."""
     which, box_body = rng.choice(SHAPES), rng.random() < 0.5
     if parameters.task == "rotate":
         edge = parameters.edge / 2
         return ObjectShape("box", (Primitive("box", (edge, edge, edge)),))
+    if parameters.task == "rotate_any":
+        a, b, c = (float(edge) for edge in parameters.edge / 2 * parameters.proportions)
+        if box_body:
+            return ObjectShape("box", (Primitive("box", (a, b, c)),))
+        return ObjectShape("cylinder", (Primitive("disc", (b, a)),))
     name = name or str(which)
     half = tuple(float(h) for h in parameters.box_half)
     tube = parameters.cylinder_radius, parameters.cylinder_half
