@@ -112,7 +112,7 @@ def _make(
             waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
             if not len(waiting) or tried > 1000 and len(starts) < tried / (2000 if trap else 200):
                 break
-    if len(starts) < (1 if trap else 0.95 * size):
+    if len(starts) < (1 if trap else 0.9 * size):
         raise ConfigError(
             f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
             f"in the hand ({tried} tried); change posture, tilt, edge or support"
