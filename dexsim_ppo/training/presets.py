@@ -35,6 +35,7 @@ _CPU = Preset(
 # A gait is found on nearly nominal hands and widened: twice the turns of a training on the full ranges. What counts is
 # the goals of an episode: two goals and a stop end it early, so that their rate is that of a slow gait.
 _WIDENING = CurriculumConfig(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
+_FROM_MEMORY = ("rotate_without_orientation", "rotate_any")  # Touch tells the orientation over time only.
 PRESETS = {
     "cpu": _CPU,
     # 16 cores and more: enough environments for all of them. Sized from trainings of rotate on 2 to 12 cores.
@@ -85,7 +86,8 @@ def find_preset(name: str, task: str) -> Preset:
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
-        return replace(preset, ppo=replace(ppo, num_envs=16384, memory="none"), minutes=5.0)
+        memory = "gru" if task in _FROM_MEMORY else "none"
+        return replace(preset, ppo=replace(ppo, num_envs=16384, memory=memory), minutes=5.0)
     curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from c_scene import double_precision
@@ -20,8 +21,8 @@ from dexsim.hand.kinematics import forward_kinematics, tip_twist
 from dexsim.physics.config import PhysicsConfig
 from dexsim.task_spec import TurnSpec
 from dexsim.tasks.placement import palm_height
-from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
-from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, upright
+from dexsim.tasks.rotate.config import RotateConfig, RotateReward, any_object, clear_of_palm, paper
+from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, solid_inertia, upright
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import _fingerprint
 from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
@@ -356,6 +357,31 @@ class TestDrop:
         for gap, lost in ((0.0005, True), (0.0015, False)):
             place = np.asarray(task.reference) * [0, 1, 1] + [palm + half + gap, 0, 0]
             assert bool(task.dropped(goal, truth(task, object_position=place))) == lost
+
+
+def test_boxes_and_cylinders_have_the_inertia_that_mujoco_computes():
+    config, kinds = any_object(), set()
+    draw = jax.jit(lambda key: (object := sample_turned_object(key, config), solid_inertia(object)))
+    for seed in range(12):
+        object, inertia = draw(jax.random.key(seed))
+        slot = int(np.argmax(object.active))
+        kinds.add(kind := object.kinds[slot])
+        spec = mujoco.MjSpec()
+        body = spec.worldbody.add_body(name="object")
+        geom = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), mass=1.0)
+        geom.size, geom.quat = object.size[slot], object.quat[slot]
+        model = spec.compile()
+        turn = Rotation.from_quat(np.roll(model.body_iquat[1], -1)).as_matrix()
+        np.testing.assert_allclose(turn @ np.diag(model.body_inertia[1]) @ turn.T, np.diag(inertia), atol=1e-8)
+        assert np.sum(object.active) == 1
+        assert 0.9 * 0.0225 <= np.min(object.size[slot][:2]) <= np.max(object.size[slot][:2]) <= 1.1 * 0.0325
+        height = lowest_point(object, np.array([1.0, 0, 0, 0]), np.zeros(3))
+        np.testing.assert_allclose(-height, object.size[slot][0 if kind == "box" else 1], rtol=1e-5)
+    assert kinds == {"box", "cylinder"}
+    with pytest.raises(ConfigError, match="expected box or cylinder"):
+        dataclasses.replace(config, objects=dataclasses.replace(config.objects, shapes=("sphere",)))
+    with pytest.raises(ConfigError, match="palm's normal"):
+        dataclasses.replace(clear_of_palm(), proportions=(0.9, 1.1))
 
 
 class TestPool:

@@ -1,6 +1,7 @@
 """PPO end to end on the tiny environment."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.learner.update import Learner
+from dexsim_ppo.policy import Policy
 
 
 def test_reaches_the_known_return():
@@ -37,6 +39,21 @@ def test_the_first_minibatch_sees_the_policy_that_collected():
         state, metrics = training.step(state)
         assert float(metrics["kl"][0]) < 1e-9 and float(metrics["clip_fraction"][0]) == 0
         assert abs(float(metrics["policy_loss"][0])) < 1e-5
+
+
+def test_the_average_is_over_about_the_last_tenth():
+    """Weights of iteration i count as binomial(i + 9, 9), which grows like i^9; a policy is made of them."""
+    training = make_train(TinyEnv(), dataclasses.replace(SMALL, iterations_per_call=1))
+    state = training.init(jax.random.key(0))
+    kernels = []
+    for _ in range(12):
+        state, _ = training.step(state)
+        kernels.append(np.asarray(state.params.actor[0].kernel))
+    weights = [math.comb(i + 9, 9) for i in range(12)]
+    expected = np.average(kernels, axis=0, weights=weights)
+    np.testing.assert_allclose(state.average[0][0].kernel, expected, rtol=1e-4, atol=1e-6)
+    policy = Policy.from_training(TinyEnv(), SMALL, state)
+    np.testing.assert_array_equal(policy.params.layers[0].kernel, state.average[0][0].kernel)
 
 
 def test_compiles_once():

@@ -16,12 +16,12 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
         Primitive("box", (0.02, 0.03, 0.025)),
         Primitive("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
         Primitive("capsule", (0.015, 0.02)),
+        Primitive("disc", (0.02, 0.03)),
     ],
 )
 def test_distances_agree_with_mujoco(part):
     spec = mujoco.MjSpec()
-    size = [*part.size, 0.0, 0.0][:3]
-    spec.worldbody.add_geom(name="part", type=scene.KINDS[part.kind], size=size, pos=part.place)
+    scene.add_object(spec, ObjectShape("x", (part,)))
     for k in range(200):
         spec.worldbody.add_geom(
             name=f"p{k}",
@@ -31,10 +31,13 @@ def test_distances_agree_with_mujoco(part):
         )
     model = spec.compile()
     data = mujoco.MjData(model)
+    data.qpos[:3] = 0.0
     mujoco.mj_kinematics(model, data)
-    points = data.geom_xpos[1:]
+    part_id = model.geom("object_0").id
+    ids = [model.geom(f"p{k}").id for k in range(200)]
+    points = data.geom_xpos[ids]
     ours = ObjectShape("x", (part,)).distance(points)
-    theirs = np.array([mujoco.mj_geomDistance(model, data, 0, k + 1, 1.0, np.zeros(6)) + 1e-5 for k in range(200)])
+    theirs = np.array([mujoco.mj_geomDistance(model, data, part_id, k, 1.0, np.zeros(6)) + 1e-5 for k in ids])
     outside = theirs > 1e-3
     assert ours[outside] == pytest.approx(theirs[outside], abs=1e-5)
     assert np.all((ours < 0) == (theirs < 0))
@@ -58,3 +61,14 @@ def test_all_shapes_are_drawn():
     parameters = sample_trial("grasp", np.random.default_rng(0))
     drawn = {shapes.sample_shape(parameters, np.random.default_rng(k)).name for k in range(60)}
     assert drawn == set(shapes.SHAPES)
+
+
+def test_rotate_any_draws_boxes_and_upright_cylinders():
+    drawn = [
+        shapes.sample_shape(sample_trial("rotate_any", np.random.default_rng(k)), np.random.default_rng(k))
+        for k in range(40)
+    ]
+    sizes = np.concatenate([part.size for shape in drawn for part in shape.parts])
+    assert {shape.name for shape in drawn} == {"box", "cylinder"}
+    assert 0.9 * 0.045 / 2 <= sizes.min() < 0.022 and 0.032 < sizes.max() <= 1.1 * 0.065 / 2
+    assert {shape.parts[0].kind for shape in drawn} == {"box", "disc"}
