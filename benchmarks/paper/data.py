@@ -106,6 +106,8 @@ class Row:
     """Observation fields that the policy does without."""
     points: tuple[float, ...] = ()
     """Of a sweep, in order."""
+    plant: tuple[str, ...] = ()
+    """Parameters of the emulated hand that are not drawn, such as edge=0.055."""
     paper: dict[str, str] = dataclasses.field(default_factory=dict)
     """The paper's numbers, by column."""
 
@@ -154,7 +156,7 @@ def settings_of(row: Row) -> dict[str, Any]:
     settings = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("label", "paper")
+        if name not in ("label", "paper") and (name != "plant" or value)
     }
     return settings | ({"weights": weights_of(asset_path(f"policies/{row.policy}.msgpack"))} if row.policy else {})
 

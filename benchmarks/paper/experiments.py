@@ -1,5 +1,9 @@
 """The experiments: each table and figure as rows, with the paper's numbers; docs/results.md says what differs."""
 
+import itertools
+import json
+from collections.abc import Iterator
+
 from paper import figures, measure, tables
 from paper.data import Experiment, Row
 from paper.measure import points_at_twice
@@ -112,6 +116,49 @@ _READINGS = (
     ("orientation", "orientation ablated", ("relative_orientation",)),
 )
 
+_ORIENTATIONS = {
+    "exact": ("sensing.orientation.bias=0", "sensing.orientation.noise=0", "sensing.orientation.drift=0"),
+    "0.1 rad": ("sensing.orientation.bias=0.1",),
+    "0.3 rad": ("sensing.orientation.bias=0.3",),
+    "none": (),
+}
+_OBJECTS = {
+    "cube": ("edge=[0.055,0.055]",),
+    "sizes": ("edge=[0.045,0.065]",),
+    "shapes": ('objects.shapes=["box","cylinder"]', "edge=[0.045,0.065]", "proportions=[0.9,1.1]"),
+}
+_ROUGH = (
+    *("push_probability=0.01", "push_speed=0.2"),
+    *("objects.friction=[0.1,1.6]", "objects.link_friction=[0.1,1.2]"),
+)
+
+
+def _map_rows() -> Iterator[Row]:
+    """Each world with and without touch. Of what the emulated hand draws, `plant` fixes what the world is about."""
+    for orientation, object, rough, touch in itertools.product(_ORIENTATIONS, _OBJECTS, (False, True), (True, False)):
+        left_out = [] if touch else ["contact_force", "contact_centre"]
+        left_out += ["relative_orientation"] if orientation == "none" else []
+        world = f"{orientation}, {object}, {'rough' if rough else 'as trained'}"
+        error = float(orientation[:3]) if orientation[0] == "0" else 0.0
+        yield Row(
+            name=f"{world}, {'touch' if touch else 'no touch'}".replace(" ", "_").replace(",", ""),
+            label=world,
+            task="rotate",
+            settings=(
+                *_ORIENTATIONS[orientation],
+                *_OBJECTS[object],
+                *(_ROUGH if rough else ()),
+                f"observation.leave_out={json.dumps(left_out)}",
+            ),
+            plant=(
+                f"imu_bias={error}",
+                f"push_rate={2 if rough else 1}",
+                *(("edge=0.055",) if object == "cube" else ()),
+                *(("gravity_tilt=0.1",) if object == "shapes" else ()),
+            ),
+        )
+
+
 _ALL = (
     Experiment(
         name="observations",
@@ -148,6 +195,15 @@ _ALL = (
         table=tables.grasp,
         draw=figures.command_curves,
         training_seeds=5,
+    ),
+    Experiment(
+        name="touch_map",
+        title="Where touch pays: rotation with and without it",
+        rows=tuple(_map_rows()),
+        measure=measure.mapped,
+        table=tables.touch_map,
+        draw=figures.touch_map,
+        training_seeds=3,
     ),
     Experiment(
         name="readings",

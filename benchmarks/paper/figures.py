@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from paper.data import Experiment
-from paper.tables import seeds
+from paper.tables import mean_turns, seeds
 
 Reports = dict[str, dict[str, Any]]
 COLORS = ("#1f77b4", "#d95f02", "#2a9d5c", "#7b4fa3", "#8c6d31", "#555555", "#c0305e")
@@ -45,6 +45,23 @@ def successes(experiment: Experiment, reports: Reports, folder: Path) -> None:
     axis.set(xlabel="share of the trials, sorted", ylabel="consecutive successes", xlim=(0, 1), ylim=(0, None))
     axis.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _save(figure, folder / "successes.svg")
+
+
+def touch_map(experiment: Experiment, reports: Reports, folder: Path) -> None:
+    """Quarter turns of each world with touch and without it, a dot a seed."""
+    pairs = list(zip(experiment.rows[::2], experiment.rows[1::2], strict=True))
+    figure, axes = _subplots(1, 3, 3.2, 6.0)
+    for axis, world in zip(axes[0], ("simulation", "hand", "foreign"), strict=True):
+        for place, pair in enumerate(pairs):
+            means = [[mean_turns(s, world)["mean"] for s in seeds(reports.get(row.name))] for row in pair]
+            for color, values in zip(COLORS, means, strict=False):
+                axis.plot(values, [place] * len(values), ".", color=color, ms=5)
+                axis.plot([np.mean(values or np.nan)], [place], "|", color=color, ms=12)
+        title = {"hand": "emulated hand", "foreign": "foreign plant"}.get(world, world)
+        axis.set(title=title, xlabel="quarter turns in 120 s", yticks=[], ylim=(len(pairs), -1), xlim=(0, None))
+    axes[0, 0].set_yticks(range(len(pairs)), [row.label for row, _ in pairs], fontsize=7)
+    figure.supxlabel("blue: with touch; orange: without; a dot a training seed", fontsize=8)
+    _save(figure, folder / "touch_map.svg")
 
 
 def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> None:

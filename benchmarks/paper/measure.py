@@ -14,9 +14,10 @@ from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
-from paper.data import BUDGETS, Budget, Measure, Row
+from paper.data import BUDGETS, ROOT, Budget, Measure, Row
 
 HELD_OUT_POOL = 480
+FOREIGN = str(ROOT / "assets" / "plants" / "foreign_right.xml")
 NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
 """A preset's own budget of training does not count."""
 
@@ -49,6 +50,21 @@ def measured(*worlds: str) -> Measure:
         return report
 
     return measure
+
+
+def mapped(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """Train a seed of a row; then simulation, the emulated hand and a foreign plant, in the row's world."""
+    file, training = train(row, seed, budget, work) if budget.training else (row.skill, None)
+    task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.task
+    given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
+    return {
+        "training": training,
+        "simulation": simulate(
+            load_policy(file), (), budget.episodes[row.skill], budget.seconds.get(row.skill), budget
+        ),
+        "hand": trials(task, str(file), seed, budget.name, given),
+        "foreign": trials(task, str(file), seed, budget.name, given, FOREIGN),
+    }
 
 
 def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
@@ -160,23 +176,27 @@ def _evaluator(task: str, config: str, backend: str, chunk: int) -> Evaluator:
 
 
 @functools.lru_cache(maxsize=4)
-def trials(skill: str, policy: str, seed: int, budget_name: str) -> dict[str, Any]:
-    """The metrics of trials on the emulated hand in virtual time, every parameter outside training's ranges."""
+def trials(
+    task: str, policy: str, seed: int, budget_name: str, given: tuple = (), plant_model: str | None = None
+) -> dict[str, Any]:
+    """The metrics of trials on the emulated hand in virtual time, every parameter outside training's ranges but those
+    that are `given`."""
     import zero_shot
 
-    budget = BUDGETS[budget_name]
+    budget, skill = BUDGETS[budget_name], task.partition("_")[0]
     options = {
-        "task": skill,
+        "task": task,
         "policy": policy,
         "seed": [seed],
         "parameters": "outside",
         "seconds": budget.seconds.get(skill),
         "safety": True,
-        "set": {},
+        "set": dict(given),
         "limit": {},
+        "plant_model": plant_model,
     }
     reports = zero_shot.run_all(options, budget.trials[skill], budget.processes, show=False)
-    return zero_shot.metrics(skill, policy, reports) | {"trials": len(reports)}
+    return zero_shot.metrics(task, policy, reports) | {"trials": len(reports)}
 
 
 # --- objects that no training has seen -------------------------------------------------------------------

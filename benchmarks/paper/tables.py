@@ -86,6 +86,24 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     return lines
 
 
+def mean_turns(seed: dict[str, Any], world: str) -> dict[str, Any]:
+    """Mean of the quarter turns in a trial, with its interval."""
+    found = seed[world]["successes"]
+    return found["mean"] if world == "simulation" else found
+
+
+def touch_map(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """Quarter turns of each world with touch and without it."""
+    lines = [["orientation, object, pushes and friction"]]
+    worlds = {"simulation": "simulation", "hand": "emulated hand", "foreign": "foreign plant"}
+    lines[0] += [f"{name}: {touch}" for name in worlds.values() for touch in ("touch", "none")] + ["measured"]
+    for row, without in zip(experiment.rows[::2], experiment.rows[1::2], strict=True):
+        pair = [seeds(reports.get(each.name)) for each in (row, without)]
+        cells = [cell(mean_turns(seed, world) for seed in each) for world in worlds for each in pair]
+        lines.append([row.label, *cells, how(experiment, row, reports.get(row.name))])
+    return lines
+
+
 def _seconds_each(count: float, seconds: float) -> dict[str, Any]:
     """Seconds a success over all the time that trials lasted."""
     return {"mean": seconds / count if count else None}
