@@ -19,7 +19,6 @@ COMMANDS = {
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
     "demo": ("dexsim.view.demo", "show a shipped policy in the browser, without JAX too"),
     "view": ("dexsim.view.__main__", "show a hand live in the browser"),
-    "average": ("dexsim_ppo.average", "average policies that were fine-tuned from one"),
     "export": ("dexsim_ppo.export", "write a policy as an ONNX model or a bundle"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
     "run": ("dexsim_real.run.__main__", "run a policy on the hand"),

@@ -42,7 +42,7 @@ FLOORS = {
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),
-        ("average", "train"),
+        ("train",),
         ("",),
     ),
     "dexsim_real": (

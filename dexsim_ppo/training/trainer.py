@@ -264,7 +264,7 @@ class Run:
         print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing", flush=True)
         begin = time.perf_counter()
         trained, untrained = load_policy(selected), load_policy(folder.untrained)
-        if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
+        if trained.training.get("iteration") == 0:
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}

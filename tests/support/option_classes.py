@@ -3,7 +3,6 @@
 OPTIONS = {
     "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
-    "dexsim_ppo.average": ("dexsim_ppo.average:AverageArguments", ["rotate", "rotate", "--output", "x.msgpack"]),
     "dexsim_ppo.export": ("dexsim_ppo.export:ExportArguments", ["grasp", "--output", "grasp.onnx"]),
     "dexsim_ppo.record": ("dexsim_ppo.record:RecordArguments", ["grasp", "--rrd", "x.rrd"]),
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
