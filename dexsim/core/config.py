@@ -32,12 +32,13 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: Collection[str] | None = None,
+    nominal: float | None = None,
 ) -> Any:
     """A configuration field with its unit and allowed range, checked by `Config`.
 
-    Numbers inside a tuple are each held to the range.
+    Numbers inside a tuple are each held to the range. `nominal` is the value that a range is drawn about.
     """
-    metadata = {"unit": unit, "low": low, "high": high, "choices": choices}
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "nominal": nominal}
     return dataclasses.field(default=default, metadata=metadata)
 
 
