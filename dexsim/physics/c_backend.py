@@ -127,10 +127,9 @@ class HostEngine:
           RuntimeError: in a forked child, which has none of its parent's threads.
         """
         shape = out[0].shape[:-1]
-        rank, size = len(shape), math.prod(shape)
-        inputs = [_flatten(x, shape, rank, size) for x in arguments]
+        inputs = [_flatten(x, shape) for x in arguments]
         with _lock, _no_warnings():
-            worlds = self._worlds(size)
+            worlds = self._worlds(math.prod(shape))
             if worlds.process != os.getpid():
                 raise RuntimeError(
                     "backend 'c' does not work in a forked process, which lacks its threads: "
@@ -202,9 +201,9 @@ def _no_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _flatten(value: np.ndarray, shape: tuple[int, ...], rank: int, size: int) -> np.ndarray:
-    """`value` with one batch axis, of length one if the whole batch shares it."""
-    lead, own = value.shape[:rank], value.shape[rank:]
-    if math.prod(lead) == 1 and size != 1:
+def _flatten(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """`value` [*shape, ...] with one batch axis, of length one if the whole batch shares it."""
+    lead, own = value.shape[: len(shape)], value.shape[len(shape) :]
+    if math.prod(lead) == 1:
         return value.reshape(1, *own)
-    return np.broadcast_to(value, shape + own).reshape(size, *own)
+    return np.broadcast_to(value, shape + own).reshape(-1, *own)

@@ -363,14 +363,12 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
         row = rows.get(pair, -1 - len(springs))
         if row < 0:
             springs.append([model.pair_friction[pair, 0], *model.pair_solref[pair], *model.pair_solimp[pair]])
-        lines.append(f"  {{{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}}},")
+        lines.append(f"{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}")
     return [
         "// Links (the object's last), row among the object's pairs (or -1 - that among the others), finger whose tip",
         "// presses on the object, -1 where the object is the pair's first, inverse weights of both bodies in 1/kg.",
         "struct Pair { int first, second, row, finger; float side, compliance; };",
-        f"__device__ const Pair PAIR[{len(lines)}] = {{",
-        *lines,
-        "};",
+        *_table("Pair", "PAIR", lines),
         _array("HAND_SPRING", np.array(springs or np.zeros((1, 8)))),
     ]
 
