@@ -57,33 +57,4 @@ __all__ = [
     "take_snapshot",
 ]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    __all__,
-    {
-        "Env": "dexsim.env.env",
-        "EnvConfig": "dexsim.env.config",
-        "Evaluation": "dexsim.env.evaluation",
-        "GraspConfig": "dexsim.tasks.grasp.config",
-        "GraspReward": "dexsim.tasks.grasp.config",
-        "GroundTruth": "dexsim.env.task",
-        "Hand": "dexsim.hand.description",
-        "ObjectConfig": "dexsim.objects.config",
-        "Readings": "dexsim.observation",
-        "RotateConfig": "dexsim.tasks.rotate.config",
-        "RotateReward": "dexsim.tasks.rotate.config",
-        "Start": "dexsim.env.state",
-        "State": "dexsim.env.state",
-        "Task": "dexsim.env.task",
-        "TaskSpec": "dexsim.task_spec",
-        "draw_taxels": "dexsim.render.render",
-        "enable_caches": "dexsim.core.cli",
-        "load_hand": "dexsim.hand.load",
-        "make": "dexsim.registry",
-        "observe": "dexsim.observation",
-        "register": "dexsim.registry",
-        "render_episode": "dexsim.render.render",
-        "render_frame": "dexsim.render.render",
-        "take_snapshot": "dexsim.env.evaluation",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__, __all__)

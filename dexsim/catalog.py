@@ -1,17 +1,11 @@
 """The command `dexsim tasks`: what there is to train, on which hands, and which policies are shipped."""
 
-import dataclasses
 from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
 from dexsim.hand.files import DEFAULT
 from dexsim.registry import TASKS
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CatalogArguments:
-    """The command has no options."""
 
 
 def catalog() -> dict[str, list[str]]:
@@ -22,8 +16,8 @@ def catalog() -> dict[str, list[str]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code."""
-    cli.parse(CatalogArguments, argv, prog="dexsim tasks", description="List tasks, hands and shipped policies.")
+    """The command, which has no options. Returns its exit code."""
+    del argv
     for kind, names in catalog().items():
         print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
     return 0

@@ -17,29 +17,9 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniforms
 from dexsim.hand.description import Hand
 
-NOMINAL = {
-    "stiffness_factor": 1.0,
-    "damping_factor": 1.0,
-    "dead_band": 0.0,
-    "torque_factor": 1.0,
-    "speed_factor": 1.0,
-    "efficiency": 1.0,
-    "latency": 0.0,
-    "sensing_latency": 0.0,
-    "encoder_bias": 0.0,
-    "torque_gain": 1.0,
-    "taxel_gain": 1.0,
-    "gravity_tilt": 0.0,
-    "latency_spread": 0.0,
-    "ripple": 0.0,
-    "coulomb_friction": 0.0,
-    "viscous_friction": 0.0,
-    "pad_thickness_delta": 0.0,
-}
-"""The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
-# Which of an episode's 20 keys draws which of these; the ripples' number and phase have two more.
-_KEYS, _RIPPLE_COUNT, _RIPPLE_PHASE = np.array([*range(14), 16, 17, 19]), 14, 15
+# Which of an episode's 20 keys draws which of `NOMINAL`; the ripples' number and phase have two more.
+_KEYS, _RIPPLE_COUNT, _RIPPLE_PHASE = np.array([*range(7), 12, 13, 16, 17, *range(7, 12), 19]), 14, 15
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,42 +33,42 @@ class Randomization(Config):
     """Nominal proportional gain k_p (not published for this hand)."""
     damping: float = setting(0.1, unit="Nm s/rad", low=0.0, high=10.0)
     """Nominal derivative gain k_d."""
-    stiffness_factor: Range = setting((0.8, 1.2), unit="1", low=0.05, high=10.0)
+    stiffness_factor: Range = setting((0.8, 1.2), nominal=1.0, unit="1", low=0.05, high=10.0)
     """Factor on k_p."""
-    damping_factor: Range = setting((0.7, 1.3), unit="1", low=0.0, high=10.0)
+    damping_factor: Range = setting((0.7, 1.3), nominal=1.0, unit="1", low=0.0, high=10.0)
     """Factor on k_d."""
-    dead_band: Range = setting((0.0, 0.01), unit="rad", low=0.0, high=0.2)
+    dead_band: Range = setting((0.0, 0.01), nominal=0.0, unit="rad", low=0.0, high=0.2)
     """Backlash threshold epsilon; nominal 0."""
-    torque_factor: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    torque_factor: Range = setting((0.9, 1.1), nominal=1.0, unit="1", low=0.05, high=5.0)
     """Factor on the stall torque."""
-    speed_factor: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    speed_factor: Range = setting((0.9, 1.1), nominal=1.0, unit="1", low=0.05, high=5.0)
     """Factor on the no-load speed."""
-    efficiency: Range = setting((0.85, 1.0), unit="1", low=0.05, high=2.0)
+    efficiency: Range = setting((0.85, 1.0), nominal=1.0, unit="1", low=0.05, high=2.0)
     """Efficiency eta; nominal 1."""
-    latency: Range = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    latency: Range = setting((0.0, 0.02), nominal=0.0, unit="s", low=0.0, high=0.2)
     """Delay from command to motor, common to all joints, in whole sub-steps; nominal 0. At most
     two control ticks are modelled."""
-    latency_spread: Range = setting((0.0, 0.005), unit="s", low=0.0, high=0.2)
+    latency_spread: Range = setting((0.0, 0.005), nominal=0.0, unit="s", low=0.0, high=0.2)
     """Further delay of each joint by itself (the bus serves them in turn); nominal 0."""
-    ripple: Range = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    ripple: Range = setting((0.0, 0.03), nominal=0.0, unit="1", low=0.0, high=0.3)
     """Amplitude of the torque ripple, as a share of the torque; nominal 0."""
     ripple_count: Range = setting((20.0, 200.0), unit="1/rad", low=0.0, high=2000.0)
     """Ripples per radian of the joint. Neither it nor the phase has a nominal value."""
-    coulomb_friction: Range = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    coulomb_friction: Range = setting((0.0, 0.03), nominal=0.0, unit="1", low=0.0, high=0.3)
     """Coulomb friction as a share of the joint's stall torque; nominal 0."""
-    viscous_friction: Range = setting((0.0, 0.01), unit="Nm s/rad", low=0.0, high=1.0)
+    viscous_friction: Range = setting((0.0, 0.01), nominal=0.0, unit="Nm s/rad", low=0.0, high=1.0)
     """Viscous friction, on top of the damping in the hand's MJCF; nominal 0."""
-    sensing_latency: Range = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    sensing_latency: Range = setting((0.0, 0.02), nominal=0.0, unit="s", low=0.0, high=0.2)
     """Age of the readings; nominal 0. At most one control tick is modelled."""
-    encoder_bias: float = setting(0.01, unit="rad", low=0.0, high=0.2)
+    encoder_bias: float = setting(0.01, nominal=0.0, unit="rad", low=0.0, high=0.2)
     """Largest constant error of a joint angle, in its reading and in its motor's loop."""
-    torque_gain: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    torque_gain: Range = setting((0.9, 1.1), nominal=1.0, unit="1", low=0.05, high=5.0)
     """Factor on a joint's torque reading: error of the current-to-torque calibration."""
-    taxel_gain: Range = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
+    taxel_gain: Range = setting((0.9, 1.1), nominal=1.0, unit="1", low=0.05, high=5.0)
     """Factor on a finger's taxel readings."""
-    gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
+    gravity_tilt: float = setting(0.1, nominal=0.0, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
-    pad_thickness_delta: Range = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
+    pad_thickness_delta: Range = setting((-0.003, 0.0), nominal=0.0, unit="m", low=-0.01, high=0.01)
     """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.pad_thickness`,
     `Skin.margin`); nominal 0. The maker's fingertip ends within 0.5 mm of the taxels, soft rubber yields before it
     bears load: how far out a contact begins is not known. Thicknesses below 0 count as 0."""
@@ -113,6 +93,14 @@ class Randomization(Config):
             low, high = getattr(self, name)
             if 1 + width * (low - 1) < 0:
                 raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) {where}: reaches below 0")
+
+
+NOMINAL: dict[str, float] = {
+    field.name: field.metadata["nominal"]
+    for field in dataclasses.fields(Randomization)
+    if field.metadata["nominal"] is not None
+}
+"""The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 
 
 @pytree_dataclass

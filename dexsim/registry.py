@@ -33,7 +33,6 @@ from dexsim.tasks.rotate.task import Rotate
 class TaskEntry:
     """How a task is made."""
 
-    config_class: type[EnvConfig]
     task: Callable[[Any, Hand], Task]
     """`task(config, hand)`: the rules; see `dexsim.env.task.Task`."""
     config: Callable[[], EnvConfig]
@@ -41,15 +40,20 @@ class TaskEntry:
     environment: Callable[[], Any] | None = None
     """Makes an environment that is no task on a hand; the entry then has no rules and no settings."""
 
+    @property
+    def config_class(self) -> type[EnvConfig]:
+        """The class of its configuration."""
+        return type(self.config())
+
 
 TASKS: dict[str, TaskEntry] = {
-    "grasp": TaskEntry(grasp.GraspConfig, Grasp, grasp.GraspConfig),
-    "grasp_paper": TaskEntry(grasp.GraspConfig, Grasp, grasp.paper),
-    "rotate": TaskEntry(rotate.RotateConfig, Rotate, rotate.RotateConfig),
-    "rotate_paper": TaskEntry(rotate.RotateConfig, Rotate, rotate.paper),
-    "rotate_without_orientation": TaskEntry(rotate.RotateConfig, Rotate, rotate.without_orientation),
-    "rotate_any": TaskEntry(rotate.RotateConfig, Rotate, rotate.any_object),
-    "rotate_clear": TaskEntry(rotate.RotateConfig, Rotate, rotate.clear_of_palm),
+    "grasp": TaskEntry(Grasp, grasp.GraspConfig),
+    "grasp_paper": TaskEntry(Grasp, grasp.paper),
+    "rotate": TaskEntry(Rotate, rotate.RotateConfig),
+    "rotate_paper": TaskEntry(Rotate, rotate.paper),
+    "rotate_without_orientation": TaskEntry(Rotate, rotate.without_orientation),
+    "rotate_any": TaskEntry(Rotate, rotate.any_object),
+    "rotate_clear": TaskEntry(Rotate, rotate.clear_of_palm),
 }
 _OURS = tuple(TASKS)
 _MODULES: dict[str, str] = {}  # that tasks were found in, by their names
@@ -80,13 +84,12 @@ def register(
         config = hints.get(next(iter(inspect.signature(factory).parameters)))
         if not (inspect.isclass(config) and issubclass(config, EnvConfig)):
             raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig, or give config=")
-    default = config()
-    if not isinstance(default, EnvConfig):
-        raise ConfigError(f"{where}: the configuration is a {type(default).__name__}, not an EnvConfig")
+    if not isinstance(config(), EnvConfig):
+        raise ConfigError(f"{where}: the configuration is a {type(config()).__name__}, not an EnvConfig")
     taken = TASKS.get(name)
     if taken is not None and getattr(taken.task, "__qualname__", None) != getattr(factory, "__qualname__", ""):
         raise ConfigError(f"{where}: there is a task of that name already")
-    TASKS[name] = TaskEntry(type(default), factory, config)
+    TASKS[name] = TaskEntry(factory, config)
 
 
 def find_task(name: str) -> TaskEntry:
@@ -106,7 +109,7 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
         # Many modules may have a `make_env`: the one that is named makes it.
         if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
-            TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
+            TASKS[word] = TaskEntry(_no_task, cast(Any, NoSettings), makes)
         if word in TASKS:
             _MODULES[word] = module
     if word not in TASKS:

@@ -31,19 +31,4 @@ __all__ = [
     "train_policy",
 ]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    __all__,
-    {
-        "CurriculumConfig": "dexsim_ppo.learner.config",
-        "PPOConfig": "dexsim_ppo.learner.config",
-        "Policy": "dexsim_ppo.policy",
-        "TrainState": "dexsim_ppo.learner.ppo",
-        "TrainResult": "dexsim_ppo.train",
-        "act": "dexsim_ppo.policy",
-        "evaluate_policy": "dexsim_ppo.evaluate",
-        "load_policy": "dexsim_ppo.policy",
-        "make_train": "dexsim_ppo.learner.ppo",
-        "train_policy": "dexsim_ppo.train",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__, __all__)

@@ -33,21 +33,4 @@ __all__ = [
     "run_policy",
 ]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    __all__,
-    {
-        "Controller": "dexsim_real.control.controller",
-        "DriverState": "dexsim_real.wire.driver",
-        "HandDriver": "dexsim_real.wire.driver",
-        "HandError": "dexsim_real.core.errors",
-        "JointTargets": "dexsim_real.wire.driver",
-        "LinkConfig": "dexsim_real.wire.link",
-        "RunResult": "dexsim_real.run.session",
-        "Safety": "dexsim_real.control.safety",
-        "SafetyConfig": "dexsim_real.control.limits",
-        "SerialHand": "dexsim_real.wire.serial_hand",
-        "open_port": "dexsim_real.wire.serial_hand",
-        "run_policy": "dexsim_real.run.session",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__, __all__)

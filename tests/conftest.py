@@ -154,6 +154,21 @@ def grasp_env() -> Any:
 
 
 @pytest.fixture(scope="session")
+def simple_env() -> Any:
+    """Grasp over physics that compile in a second, with a pool of eight objects of which some are extreme."""
+    from simple_physics import SimplePhysics
+
+    import dexsim
+    from dexsim.objects.config import ObjectConfig
+    from dexsim.tasks.grasp.config import GraspConfig
+
+    objects = ObjectConfig(shapes=("box", "sphere"), extremes=0.5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+        return dexsim.make("grasp", GraspConfig(pool_size=8, objects=objects), backend="c")
+
+
+@pytest.fixture(scope="session")
 def grasp_rollout(grasp_env: Any) -> Rollout:
     """The grasp task over 8 environments; each function compiles at its first use, once."""
     return Rollout(

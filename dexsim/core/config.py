@@ -32,39 +32,31 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: Collection[str] | None = None,
+    nominal: float | None = None,
 ) -> Any:
-    """A configuration field with its unit and allowed range, checked by `validate`.
+    """A configuration field with its unit and allowed range, checked by `Config`.
 
-    Numbers inside a tuple are each held to the range.
+    Numbers inside a tuple are each held to the range. `nominal` is the value that a range is drawn about.
     """
-    metadata = {"unit": unit, "low": low, "high": high, "choices": choices}
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "nominal": nominal}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def validate(config: Any) -> None:
-    """Check every field of a config dataclass against its type and metadata; call from `__post_init__`.
-
-    Lists become tuples and NumPy's numbers Python's, as a file would give them back.
-
-    Raises:
-      ConfigError: names the class, the field, the value, and its type or the unit and the range.
-    """
-    cls: type = type(config)
-    for field in dataclasses.fields(cls):
-        where = f"{cls.__name__}.{field.name}"
-        value = _convert(_hints(cls).get(field.name), getattr(config, field.name), where)
-        object.__setattr__(config, field.name, value)
-        _check_values(field.metadata, value, where)
-
-
 class Config:
-    """Base of configuration dataclasses: every field is checked when one is made.
+    """Base of configuration dataclasses: every field is checked against its type and its `setting` when one is made.
 
-    A subclass with checks of its own extends `__post_init__` and calls this one first.
+    Lists become tuples and NumPy's numbers Python's, as a file would give them back. A subclass with checks of its own
+    extends `__post_init__` and calls this one first.
     """
 
     def __post_init__(self) -> None:
-        validate(self)
+        """Raises ConfigError: names the class, the field, the value, and its type or the unit and the range."""
+        cls: Any = type(self)
+        for field in dataclasses.fields(cls):
+            where = f"{cls.__name__}.{field.name}"
+            value = _convert(_hints(cls).get(field.name), getattr(self, field.name), where)
+            object.__setattr__(self, field.name, value)
+            _check_values(field.metadata, value, where)
 
 
 @functools.cache

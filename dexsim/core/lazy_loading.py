@@ -1,23 +1,27 @@
 """Public names of a package that are imported at first use (PEP 562), and Ctrl-C while modules load."""
 
+import ast
 import importlib
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from dexsim.core.install import install_line
 
 
-def lazy_exports(
-    package: str, names: Sequence[str], homes: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """A package's `__getattr__` and `__dir__`, from its `__name__`, its `__all__` and the modules of its late names."""
+def lazy_exports(package: str, names: Sequence[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """A package's `__getattr__` and `__dir__`, from its `__name__` and its `__all__`. The modules of its late names are
+    those that its source imports them from, for type checkers only."""
+    source = Path(str(sys.modules[package].__file__)).read_text()
+    imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def getattribute(name: str) -> Any:
-        if name not in homes:
+        if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         try:
             return getattr(importlib.import_module(homes[name]), name)

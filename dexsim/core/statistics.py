@@ -1,6 +1,7 @@
 """Proportions, means and other statistics over episodes, with 95 % intervals (host, NumPy)."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -16,45 +17,33 @@ def proportion(hits: np.ndarray) -> dict:
     return {"mean": result.statistic, "low": float(interval.low), "high": float(interval.high), "count": n}
 
 
-def mean(values: np.ndarray, samples: int = 500) -> dict:
+def mean(values: np.ndarray) -> dict:
     """Mean of `values` [N] with a bootstrap 95 % interval."""
-    return statistic(values, np.mean, "mean", samples)
+    return interval(lambda rows: values[rows].mean(), values.size)
 
 
-def median(values: np.ndarray, samples: int = 500) -> dict:
+def median(values: np.ndarray) -> dict:
     """Median of `values` [N] with a bootstrap 95 % interval."""
-    return statistic(values, np.median, "median", samples)
+    return interval(lambda rows: np.median(values[rows]), values.size, "median")
 
 
-def ratio(parts: np.ndarray, wholes: np.ndarray, samples: int = 500) -> dict:
+def ratio(parts: np.ndarray, wholes: np.ndarray) -> dict:
     """Sum of `parts` [N] over sum of `wholes` [N] with a bootstrap 95 % interval: a rate over all of a time."""
-
-    def divide(rows: np.ndarray | slice) -> float:
-        return float(parts[rows].sum() / wholes[rows].sum())
-
-    if not parts.size or not wholes.sum() > 0:
-        return {"mean": None, "low": None, "high": None}
-    low, high = bootstrap(divide, parts.size, samples)
-    return {"mean": divide(slice(None)), "low": low, "high": high}
+    return interval(lambda rows: parts[rows].sum() / wholes[rows].sum(), parts.size if wholes.sum() > 0 else 0)
 
 
-def statistic(values: np.ndarray, function: Callable, name: str, samples: int = 500) -> dict:
-    """`function` of `values` [N] under `name`, with a bootstrap 95 % interval."""
-    if values.size == 0:
+def interval(function: Callable[[Any], float], count: int, name: str = "mean", samples: int = 500) -> dict:
+    """`function(rows)` of all `count` rows under `name`, with its 95 % interval over resampled rows; None where there
+    are no rows, or where it is not a number."""
+    value = function(slice(None)) if count else np.nan
+    if np.isnan(value):
         return {name: None, "low": None, "high": None}
-    low, high = bootstrap(lambda rows: function(values[rows]), values.size, samples)
-    return {name: float(function(values)), "low": low, "high": high}
+    rng = np.random.default_rng(0)
+    low, high = np.nanpercentile([function(rng.integers(0, count, count)) for _ in range(samples)], [2.5, 97.5])
+    return {name: float(value), "low": float(low), "high": float(high)}
 
 
 def entry(result: dict) -> dict:
     """A statistic as a headline has it: its number as "value", with its interval."""
     value = next(result[name] for name in ("mean", "median", "r") if name in result)
     return {"value": value, "low": result["low"], "high": result["high"]}
-
-
-def bootstrap(function: Callable[[np.ndarray], float], count: int, samples: int) -> tuple[float, float]:
-    """The 95 % interval of `function(rows)` over resampled rows of `count`."""
-    rng = np.random.default_rng(0)
-    draws = [function(rng.integers(0, count, count)) for _ in range(samples)]
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
-    return float(low), float(high)

@@ -1,15 +1,19 @@
 """Touch of a tick: from where hand and object are, and how hard they press, to the taxels' forces."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
+from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
-from dexsim.geometry import rotations
+from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose
+from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams
-from dexsim.objects.touch_geometry import touch_geometry
 from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals
 
 
@@ -56,3 +60,28 @@ class TouchModel:
         delta = jnp.maximum(pad_thickness_delta, -self.config.physics.pad_thickness)  # the solver's
         bearing = compute_touch(hand, pose, object.shape(), *place, jnp.ones(hand.num_fingers), skin, delta)
         return touch, normal, jnp.sum(bearing.skin_force, -1)
+
+
+def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:
+    """A pure function from one episode's object to its geometry, as `dexsim.geometry.distance` takes it.
+
+    The method is closed_form (the solver's primitives), grid (the mesh, baked) or surface_points (points on the mesh,
+    or on the primitives at their drawn sizes).
+
+    Raises:
+      AssetError: the mesh cannot be baked.
+      ConfigError: a grid of primitives, whose sizes are drawn anew in every episode.
+    """
+    if method == "closed_form":
+        return ObjectParams.shape
+    if not config.mesh:
+        if method == "grid":
+            raise ConfigError(
+                "touch_method = 'grid': needs a mesh (ObjectConfig.mesh); choose closed_form or surface_points"
+            )
+        return lambda object: surface_points.from_shape(object.shape())
+    mesh_object = load_mesh_object(config)
+    module: Any = grid if method == "grid" else surface_points
+    with jax.ensure_compile_time_eval():
+        geometry = grid.bake(mesh_object.mesh) if method == "grid" else surface_points.from_mesh(mesh_object.mesh)
+    return lambda object: module.scaled(geometry, object.size[0, 0] / mesh_object.boxes.size[0, 0])

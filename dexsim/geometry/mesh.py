@@ -1,7 +1,8 @@
 """Triangle meshes: checked at the door, and their exact signed distance in NumPy (for baking and for tests).
 
-The sign comes from the angle-weighted pseudo-normal at the nearest point (Baerentzen and Aanaes 2005), which is exact
-for a closed mesh that does not cut through itself; `check_sign` compares it with the winding number.
+The sign is that of the nearest triangle; where several share the nearest point, of the one whose plane is farthest away
+(Payne and Toga 1992), which is exact for a closed mesh that does not cut through itself. `check_sign` compares it with
+the winding number.
 
 Shapes: V vertices, T triangles, P points. Units: m, float64.
 """
@@ -26,6 +27,7 @@ from dexsim.core.errors import AssetError
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
+_TIE = 1e-12  # m, triangles whose distances differ by less are equally near
 _SAME = 3**0.5 * 1e-7  # share of a mesh's size: corners nearer to each other than this are one
 REPAIRS = ("none", "shell", "hull")
 """What `load_mesh` does with a mesh that is not closed."""
@@ -71,24 +73,6 @@ class Mesh:
         """Lowest and highest corner [2, 3] m."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
-    @cached_property
-    def pseudo_normals(self) -> np.ndarray:
-        """[T, 7, 3]: of each triangle's face, its edges (opposite to corner 0, 1, 2) and its corners (0, 1, 2)."""
-        a, b, c = np.moveaxis(self.corners, 1, 0)
-        normal, faces = self.normals, self.faces
-        at_vertex = np.zeros_like(self.vertices)
-        for corner, (p, q, r) in enumerate(((a, b, c), (b, c, a), (c, a, b))):
-            cosine = np.sum(_unit(q - p) * _unit(r - p), -1)
-            angle = np.arccos(np.clip(cosine, -1, 1))
-            np.add.at(at_vertex, faces[:, corner], angle[:, None] * normal)
-        edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], 1), -1)  # [T, 3, 2]
-        key = edges[..., 0] * len(self.vertices) + edges[..., 1]
-        _, edge = np.unique(key, return_inverse=True)
-        edge = edge.reshape(-1, 3)
-        at_edge = np.zeros((edge.max() + 1, 3))
-        np.add.at(at_edge, edge, np.broadcast_to(normal[:, None], (*edge.shape, 3)))
-        return np.concatenate([normal[:, None], at_edge[edge], at_vertex[faces]], 1)
-
 
 def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repair: str = "none") -> Mesh:
     """Read a mesh file, or take a `trimesh.Trimesh` or a pair (vertices, faces), and check it.
@@ -130,15 +114,45 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repai
 
 
 def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface the pseudo-normal), at points."""
+    """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface a face's normal), at points."""
     points = np.asarray(points, np.float64).reshape(-1, 3)
     nearest, normal = find_nearest(mesh, points)
     apart = points - nearest
     gap = np.linalg.norm(apart, axis=-1)
     sign = np.where(np.sum(apart * normal, -1) < 0, -1.0, 1.0)
     close = gap < 1e-9
-    gradient = np.where(close[:, None], _unit(normal), sign[:, None] * apart / np.where(close, 1.0, gap)[:, None])
+    gradient = np.where(close[:, None], normal, sign[:, None] * apart / np.where(close, 1.0, gap)[:, None])
     return sign * gap, gradient
+
+
+def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest surface point [P, 3], and the normal [P, 3] of the triangle there that tells inside from outside.
+
+    No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
+    measure for each point.
+    """
+    import trimesh
+
+    corners = mesh.corners
+    reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
+    middle = (corners.min(1) + corners.max(1)) / 2
+    radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + _TIE
+    nearest, normal = np.empty_like(points), np.empty_like(points)
+    step = max(1, BLOCK // len(corners))
+    for start in range(0, len(points), step):
+        some = points[start : start + step]
+        row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
+        candidate = trimesh.triangles.closest_point(corners[face], some[row])
+        apart = some[row] - candidate
+        gap = np.linalg.norm(apart, axis=-1)
+        least = np.full(len(some), np.inf)
+        np.minimum.at(least, row, gap)
+        tied = gap <= least[row] + _TIE
+        off_plane = np.where(tied, np.abs(np.sum(apart * mesh.normals[face], -1)), -1.0)
+        order = np.lexsort((-off_plane, row))
+        first = order[np.searchsorted(row[order], np.arange(len(some)))]
+        nearest[start : start + step], normal[start : start + step] = candidate[first], mesh.normals[face[first]]
+    return nearest, normal
 
 
 def winding_number(mesh: Mesh, points: np.ndarray) -> np.ndarray:
@@ -310,64 +324,3 @@ def _deviation(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.n
 def _unit(vector: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     return vector / np.where(length > 0, length, 1.0)
-
-
-def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest surface point [P, 3] and its pseudo-normal [P, 3].
-
-    No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
-    measure for each point.
-    """
-    corners = mesh.corners
-    reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
-    middle = (corners.min(1) + corners.max(1)) / 2
-    radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + 1e-9
-    best = np.empty(len(points), np.int64)
-    step = max(1, BLOCK // len(corners))
-    for start in range(0, len(points), step):
-        some = points[start : start + step]
-        row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
-        candidate = corners[face]
-        weight = _barycentric(some[row], *np.moveaxis(candidate, 1, 0))
-        gap = np.sum((np.einsum("pc,pcd->pd", weight, candidate) - some[row]) ** 2, -1)
-        order = np.lexsort((gap, row))
-        first = np.searchsorted(row[order], np.arange(len(some)))
-        best[start : start + step] = face[order[first]]
-    weight = _barycentric(points, *np.moveaxis(corners[best], 1, 0))
-    zero = weight <= 1e-12
-    feature = np.where(zero.sum(1) == 0, 0, np.where(zero.sum(1) == 1, 1 + zero.argmax(1), 4 + weight.argmax(1)))
-    return np.einsum("pc,pcd->pd", weight, corners[best]), mesh.pseudo_normals[best, feature]
-
-
-def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Weights [..., 3] of a, b, c at the point of the triangle nearest to p (Ericson 2005, 5.1.5)."""
-
-    def dot(x, y):
-        return np.einsum("...d,...d->...", x, y)
-
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = dot(ab, ap), dot(ac, ap)
-    abab, abac, acac = dot(ab, ab), dot(ab, ac), dot(ac, ac)
-    d3, d4 = d1 - abab, d2 - abac  # at b
-    d5, d6 = d1 - abac, d2 - acac  # at c
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-
-    def ratio(top, bottom):
-        return np.where(bottom != 0, top / np.where(bottom != 0, bottom, 1.0), 0.0)
-
-    total = va + vb + vc
-    v, w = ratio(vb, total), ratio(vc, total)  # the face
-    on_bc = (va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0) | (total <= 0)
-    t = np.clip(ratio(d4 - d3, (d4 - d3) + (d5 - d6)), 0, 1)
-    v, w = np.where(on_bc, 1 - t, v), np.where(on_bc, t, w)
-    on_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0)
-    v, w = np.where(on_ac, 0.0, v), np.where(on_ac, ratio(d2, d2 - d6), w)
-    on_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
-    v, w = np.where(on_ab, ratio(d1, d1 - d3), v), np.where(on_ab, 0.0, w)
-    at_c = (d6 >= 0) & (d5 <= d6)
-    v, w = np.where(at_c, 0.0, v), np.where(at_c, 1.0, w)
-    at_b = (d3 >= 0) & (d4 <= d3)
-    v, w = np.where(at_b, 1.0, v), np.where(at_b, 0.0, w)
-    at_a = (d1 <= 0) & (d2 <= 0)
-    v, w = np.where(at_a, 0.0, v), np.where(at_a, 0.0, w)
-    return np.stack([1 - v - w, v, w], -1)

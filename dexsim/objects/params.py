@@ -73,16 +73,11 @@ class ObjectParams:
     inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
     com: jax.Array  # [3] m
     friction: jax.Array  # [] sliding on the fingertips
+    link_friction: jax.Array  # [] sliding on the rest of the hand
     contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
     quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
-    link_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
     kinds: tuple[str, ...] = static(default=SLOTS)
     extreme: jax.Array | None = None  # [] bool, whether every value is at an end of its range; None: no object's is
-
-    def pair_friction(self, rubber: np.ndarray) -> jax.Array:
-        """Sliding friction [P] of pairs of the object with a fingertip (`rubber` [P]) or the bare hand."""
-        bare = self.friction if self.link_friction is None else self.link_friction
-        return jnp.where(rubber, self.friction, bare)
 
     def shape(self) -> sdf.Shape:
         """The union of primitives, for the taxels."""
@@ -100,7 +95,7 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
       AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
     keys, extreme = jax.random.split(key, 8), sample_extreme(key, config.extremes)
-    zero, three, quat = jnp.zeros(()), jnp.zeros(3), None
+    zero, three, quat = jnp.zeros(()), jnp.zeros(3), None  # what stands in for properties
     if config.mesh:
         mesh_object = load_mesh_object(config)
         boxes, factor = mesh_object.boxes, uniform(keys[1], config.mesh_size, extreme)
@@ -119,7 +114,7 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
         position = position - com[None]  # the origin is the centre of a uniform solid
         plain = inertia / mass
     object = ObjectParams(
-        shape_index, size, position, active, zero, three, three, zero, jnp.zeros(2), quat, zero, kinds, extreme
+        shape_index, size, position, active, zero, three, three, zero, zero, jnp.zeros(2), quat, kinds, extreme
     )
     return _with_properties(object, plain, _sample_properties(keys, config, extreme))
 
@@ -156,13 +151,12 @@ def _sample_properties(keys: jax.Array, config: ObjectConfig, extreme: jax.Array
 
 def _properties_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Array]:
     """The properties of an object whose shape has the unit inertia `plain` [3]."""
-    link_friction = object.friction if object.link_friction is None else object.link_friction
     return {
         "mass": object.mass,
         "inertia_scale": object.inertia / (object.mass * plain),
         "com_offset": object.com,
         "friction": object.friction,
-        "link_friction": link_friction,
+        "link_friction": object.link_friction,
         "stiffness": object.contact[0],
         "restitution": object.contact[1],
     }
@@ -177,7 +171,7 @@ def _with_properties(object: ObjectParams, plain: jax.Array, properties: dict[st
         com=properties["com_offset"],
         friction=properties["friction"],
         contact=jnp.stack([properties["stiffness"], properties["restitution"]]),
-        link_friction=None if object.link_friction is None else properties["link_friction"],
+        link_friction=properties["link_friction"],
     )
 
 

@@ -31,17 +31,16 @@ import numpy as np
 from mujoco.batch import Batch
 
 from dexsim.core.compilation import available_cores
-from dexsim.core.errors import AssetError, ConfigError
-from dexsim.objects.params import ObjectParams
+from dexsim.core.errors import AssetError
 from dexsim.physics import ffi
 from dexsim.physics.interface import (
-    ContactParams,
+    Fields,
     ImplicitLaw,
     PhysicsScene,
     PhysicsState,
     StepResult,
     places,
-    values,
+    without_gradient,
 )
 from dexsim.physics.law import evaluator, record
 
@@ -64,48 +63,42 @@ class CBackend:
         model.body_sameframe[scene.object_body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         if model.body_simple[scene.object_body]:
             raise AssetError(f"{scene.hand.model_path}: backend c: the object's inertia was compiled as diagonal")
-        self.scene, self._key = scene, _digest(scene)
+        self.scene, self._key, self._fields = scene, _digest(scene), tuple(places(scene))
         self._engine = _engines.get(self._key) or HostEngine(scene)
         _engines[self._key] = self._engine
         _newest.append(self._engine)
         ffi.register(TARGET, "cpu", _serve)
-        self._tick = jax.custom_jvp(self._call, nondiff_argnums=(0, 1))
-        self._tick.defjvp(_no_gradient)
+        self._tick = without_gradient("c", self._call, 1)
 
-    def advance(
-        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
-    ) -> StepResult:
+    def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick in one call."""
-        fields = values(self.scene, object, contacts)
         recorded = record(law, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
-        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *recorded.constants]
-        *after, force = self._tick(tuple(fields), recorded.text, *map(jnp.asarray, arguments))
+        given = [fields[name] for name in self._fields]
+        arguments = [*given, state.qpos, state.qvel, state.warmstart, push, *recorded.constants]
+        *after, force = self._tick(recorded.text, *map(jnp.asarray, arguments))
         return StepResult(PhysicsState(*after), force)
 
-    def _call(self, fields: tuple[str, ...], law: str, *arguments: jax.Array) -> list[jax.Array]:
+    def _call(self, law: str, *arguments: jax.Array) -> list[jax.Array]:
         """Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the
         whole batch shares."""
-        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
+        count = len(self._fields)
+        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[count : count + 3]]
         force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
         call = jax.ffi.ffi_call(TARGET, [*state, force], vmap_method="expand_dims")
-        return list(call(*arguments, engine=self._key, fields=" ".join(fields), law=law))
-
-
-def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'c' has no gradient")
+        return list(call(*arguments, engine=self._key, law=law))
 
 
 class _Worlds:
     """Worlds that differ in some fields of the model, and the arrays through which they are written and read."""
 
-    def __init__(self, scene: PhysicsScene, size: int, fields: tuple[str, ...]):
+    def __init__(self, scene: PhysicsScene, size: int):
         self.process = os.getpid()
         # One thread for each core that this process may use.
         self.batch = Batch(scene.model, size, available_cores())
         where = places(scene)
-        self._fields = [[(self.batch.expand(name), where[name])] for name in fields]
+        self._fields = {name: [(self.batch.expand(name), place)] for name, place in where.items()}
         # The subtree of the object's body is the object.
-        self._fields[fields.index("body_mass")].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
+        self._fields["body_mass"].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.warmstart = self.batch.bind("qacc_warmstart")
         self.armature = self.batch.expand("dof_armature")
@@ -114,7 +107,7 @@ class _Worlds:
 
     def configure(self, values: list[np.ndarray]) -> None:
         """Write the models' fields."""
-        for targets, value in zip(self._fields, values, strict=True):
+        for targets, value in zip(self._fields.values(), values, strict=True):
             for array, where in targets:
                 array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
 
@@ -124,28 +117,26 @@ class HostEngine:
 
     def __init__(self, scene: PhysicsScene):
         """`scene` has a contact sensor for each fingertip."""
-        self.scene = scene
-        # Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
+        self.scene, self._count = scene, len(places(scene))
         self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
 
-    def tick(self, fields: tuple[str, ...], law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
+    def tick(self, law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
         """A control tick of a batch; see `CBackend._call` for what crosses.
 
         Raises:
           RuntimeError: in a forked child, which has none of its parent's threads.
         """
         shape = out[0].shape[:-1]
-        rank, size = len(shape), math.prod(shape)
-        inputs = [_flatten(x, shape, rank, size) for x in arguments]
+        inputs = [_flatten(x, shape) for x in arguments]
         with _lock, _no_warnings():
-            worlds = self._worlds(size, fields)
+            worlds = self._worlds(math.prod(shape))
             if worlds.process != os.getpid():
                 raise RuntimeError(
                     "backend 'c' does not work in a forked process, which lacks its threads: "
                     "start processes with multiprocessing.get_context('spawn')"
                 )
-            worlds.configure(inputs[: len(fields)])
-            results = self._run(worlds, law, inputs[len(fields) :])
+            worlds.configure(inputs[: self._count])
+            results = self._run(worlds, law, inputs[self._count :])
             for target, value in zip(out, results, strict=True):
                 target[...] = value.reshape(target.shape)
 
@@ -183,8 +174,7 @@ def _serve(frame: Any) -> None:
     engine = _engines.get(attributes["engine"].decode())
     if engine is None:
         raise RuntimeError("backend 'c': the environment of this program no longer exists")
-    fields = tuple(attributes["fields"].decode().split())
-    engine.tick(fields, attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
+    engine.tick(attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
 
 
 def _digest(scene: PhysicsScene) -> str:
@@ -211,9 +201,9 @@ def _no_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _flatten(value: np.ndarray, shape: tuple[int, ...], rank: int, size: int) -> np.ndarray:
-    """`value` with one batch axis, of length one if the whole batch shares it."""
-    lead, own = value.shape[:rank], value.shape[rank:]
-    if math.prod(lead) == 1 and size != 1:
+def _flatten(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """`value` [*shape, ...] with one batch axis, of length one if the whole batch shares it."""
+    lead, own = value.shape[: len(shape)], value.shape[len(shape) :]
+    if math.prod(lead) == 1:
         return value.reshape(1, *own)
-    return np.broadcast_to(value, shape + own).reshape(size, *own)
+    return np.broadcast_to(value, shape + own).reshape(-1, *own)

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.hand.description import Hand
-from dexsim.objects.params import ObjectParams, bounding_radius
 from dexsim.physics.config import PhysicsConfig
 
 TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
@@ -27,6 +27,9 @@ TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 ImplicitLaw = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 """As `TorqueLaw`, to the torque [J] Nm and the inertia [J] kg m^2 that an engine adds to the joints' (`implicit`)."""
+
+Fields = dict[str, jax.Array]
+"""What one environment has in place of the scene's constants (`places`): its object, contacts and fingertips."""
 
 
 @pytree_dataclass
@@ -43,17 +46,6 @@ class StepResult(NamedTuple):
 
     state: PhysicsState
     finger_force: jax.Array  # [F, 3] N, of the object on the finger tips at the last sub-step, palm frame
-
-
-@pytree_dataclass
-class ContactParams:
-    """Contacts of hand and object: parameters of their pairs (`PhysicsScene.object_pairs`) in MuJoCo's terms, and how
-    thick the fingertips are."""
-
-    friction: jax.Array  # [P] sliding
-    solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
-    solimp: jax.Array  # [P, 5]
-    pad_thickness_delta: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.pad_thickness`
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,14 +74,11 @@ class Backend(Protocol):
     The constructor takes the scene, and raises AssetError for one that the engine cannot run.
     """
 
-    def advance(
-        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
-    ) -> StepResult:
+    def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
 
         Args:
-          object: the object.
-          contacts: of the object's pairs during the whole tick.
+          fields: of the model, during the whole tick.
           state: where to start from.
           law: of the motors, evaluated before every sub-step.
           push: [3] N, force on the object's centre of mass during the whole tick.
@@ -100,11 +89,8 @@ class Backend(Protocol):
         ...
 
 
-# --- what one environment has in place of the scene's: its object, its contacts' parameters, its fingertips ---------
-
-
 def places(scene: PhysicsScene) -> dict[str, Any]:
-    """Fields of `mujoco.MjModel` that change, and where in them.
+    """Fields of `mujoco.MjModel` that differ between environments, and where in them.
 
     `body_invweight0` is not among them: the contact's parameters are worked out from it, and stiffness must not change
     with the mass of what is touched.
@@ -124,30 +110,21 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
     }
 
 
-def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
-    """What goes to those places; without `geom_quat` where the object's primitives are aligned with it."""
-    tips = scene.model.geom_size[scene.tip_geoms] + contacts.pad_thickness_delta * scene.tip_growth
-    # The broad phase leaves out what is farther away. Of thinner rubber the sphere round it may stay.
-    around = scene.model.geom_rbound[scene.tip_geoms]
-    around = around + jnp.maximum(contacts.pad_thickness_delta, 0.0) * np.linalg.norm(scene.tip_growth, axis=-1)
-    changed = {
-        "geom_size": jnp.concatenate([object.size, tips]),
-        "geom_rbound": jnp.concatenate([bounding_radius(object.size, scene.slots), around]),
-        "geom_pos": object.position,
-        "body_mass": object.mass,
-        "body_inertia": object.inertia,
-        "body_ipos": object.com,
-        "pair_friction": jnp.stack([contacts.friction] * 2, -1),
-        "pair_solref": contacts.solref,
-        "pair_solimp": contacts.solimp,
-    }
-    return changed if object.quat is None else changed | {"geom_quat": object.quat}
-
-
-def configured(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
-    """The whole fields of one environment's model, the scene's with `values` in their `places`."""
+def configured(scene: PhysicsScene, fields: Fields) -> dict[str, jax.Array]:
+    """The whole fields of one environment's model, the scene's with `fields` in their `places`."""
     where = places(scene)
     return {
         name: jnp.asarray(getattr(scene.model, name), jnp.float32).at[where[name]].set(value)
-        for name, value in values(scene, object, contacts).items()
+        for name, value in fields.items()
     }
+
+
+def without_gradient(backend: str, tick: Callable, static: int) -> Callable:
+    """`tick`, whose derivative is an error; its first `static` arguments are no arrays."""
+
+    def refuse(*_: Any) -> Any:
+        raise ConfigError(f"backend {backend!r} has no gradient")
+
+    refusing = jax.custom_jvp(tick, nondiff_argnums=tuple(range(static)))
+    refusing.defjvp(refuse)
+    return refusing

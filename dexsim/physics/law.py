@@ -3,11 +3,13 @@
 Motors have one source, which JAX traces for every engine. `record` writes the traced law down, so that engines can
 evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `dexsim.physics.cuda.law`. All work
 in the same precision and order; results differ where XLA fuses a product and a sum, by a rounding.
+
+A law works element by element on scalars and on vectors over the joints. So one joint's torque takes one element of
+each, and changes of shape are none.
 """
 
 import dataclasses
 import functools
-import itertools
 import json
 from collections.abc import Callable
 from typing import Any
@@ -50,6 +52,8 @@ OPERATIONS: dict[str, tuple[Callable[..., Any], str]] = {
     "sub": (np.subtract, "{0} - {1}"),
     "tanh": (np.tanh, "tanhf({0})"),
 }
+_SAME = {"broadcast_in_dim", "convert_element_type", "reshape", "squeeze"}  # values that only change shape or type
+_TYPES = ("float32", "int32", "bool")
 _LOGICAL = {"and", "or", "not", "select_n"}  # on integers they are something else
 _CALLS = ("jit", "pjit", "custom_jvp_call", "custom_vjp_call", "closed_call")
 
@@ -83,28 +87,36 @@ class Recorded:
     """A law over numbered values: first the constants, then sub-step, position and velocity."""
 
     constants: list[jax.Array]  # of the trace
-    literals: list[list[Any]]  # number, value, dtype
-    steps: list[list[Any]]  # operation, operands, result, parameter
+    literals: list[list[Any]]  # number, value
+    steps: list[list[Any]]  # operation, operands, result
+    types: list[list[Any]]  # of every value: whether it is a vector over the joints, dtype
     torque: int
     inertia: int
 
     @property
     def text(self) -> str:
         """All but the constants, for `evaluator`."""
-        inputs = range(len(self.constants), len(self.constants) + 3)
-        return json.dumps([list(inputs), self.literals, self.steps, self.torque, self.inertia])
+        return json.dumps([len(self.constants), self.literals, self.steps, self.types, self.torque, self.inertia])
 
 
 def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
     """Trace a law; of `joints` [J] only shape and type count.
 
     Raises:
-      ConfigError: it has an operation that is not element by element.
+      ConfigError: it has an operation that is not element by element, or arrays of another shape or type.
     """
     traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
     literals: list[list[Any]] = []
     steps: list[list[Any]] = []
-    numbers = itertools.count()
+    types: list[list[Any]] = []
+
+    def number(variable: Any) -> int:
+        """The next number, for a value of this type."""
+        shape, dtype = variable.aval.shape, str(variable.aval.dtype)
+        if shape not in ((), joints.shape) or dtype not in _TYPES:
+            raise _unknown(f"an array {list(shape)} {dtype}: expected [] or {list(joints.shape)}, {', '.join(_TYPES)}")
+        types.append([bool(shape), dtype])
+        return len(types) - 1
 
     def run(jaxpr: Any, inputs: list[int]) -> list[int]:
         """Numbers of a jaxpr's results."""
@@ -115,7 +127,7 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
                 return names[variable]
             if np.ndim(variable.val):
                 raise _unknown("an array that is written into it")
-            literals.append([next(numbers), np.asarray(variable.val).item(), str(variable.aval.dtype)])
+            literals.append([number(variable), np.asarray(variable.val).item()])
             return literals[-1][0]
 
         for equation in jaxpr.eqns:
@@ -124,31 +136,23 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
             if inner is not None and equation.primitive.name in _CALLS and not inner.consts:
                 results = run(inner.jaxpr, operands)
             else:
-                kind, parameter = _operation(equation)
-                results = [next(numbers)]
-                steps.append([kind, operands, results[0], parameter])
+                _check_operation(equation)
+                results = [number(equation.outvars[0])]
+                steps.append([equation.primitive.name, operands, results[0]])
             names.update(zip(equation.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    inputs = [next(numbers) for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)]
+    inputs = [number(v) for v in (*traced.jaxpr.constvars, *traced.jaxpr.invars)]
     torque, inertia = run(traced.jaxpr, inputs)
-    return Recorded(traced.consts, literals, steps, torque, inertia)
+    return Recorded(traced.consts, literals, steps, types, torque, inertia)
 
 
-def _operation(equation: Any) -> tuple[str, Any]:
-    """An equation's operation and its parameter."""
-    kind, options = equation.primitive.name, equation.params
-    if kind == "broadcast_in_dim" and len(equation.invars) == 1:
-        return kind, [list(options["shape"]), list(options["broadcast_dimensions"])]
-    if kind == "convert_element_type":
-        return kind, str(np.dtype(options["new_dtype"]))
-    if kind in ("reshape", "squeeze"):
-        return "reshape", list(equation.outvars[0].aval.shape)
-    if kind not in OPERATIONS:
+def _check_operation(equation: Any) -> None:
+    kind, operands = equation.primitive.name, equation.invars
+    if kind not in OPERATIONS and not (kind in _SAME and len(operands) == 1):
         raise _unknown(kind)
-    if kind in _LOGICAL and (equation.invars[0].aval.dtype != bool or len(equation.invars) > 3):
-        raise _unknown(f"{kind} of {equation.invars[0].aval.dtype}")
-    return kind, None
+    if kind in _LOGICAL and (operands[0].aval.dtype != bool or len(operands) > 3):
+        raise _unknown(f"{kind} of {operands[0].aval.dtype}")
 
 
 def _unknown(what: str) -> ConfigError:
@@ -164,57 +168,37 @@ BatchLaw = Callable[[int, np.ndarray, np.ndarray], list[np.ndarray]]
 @functools.lru_cache(maxsize=64)
 def evaluator(text: bytes) -> Callable[[list[np.ndarray]], BatchLaw]:
     """`Recorded.text` as a function of the law's constants, in NumPy: every array has a batch axis in front, of length
-    one if the whole batch shares it."""
-    inputs, literals, steps, *results = json.loads(text)
-    written = {number: np.asarray(value, dtype) for number, value, dtype in literals}
+    one if the whole batch shares it. A scalar of each environment is [B, 1] beside vectors [B, J]."""
+    constants, literals, steps, types, *results = json.loads(text)
+    inputs = range(constants, constants + 3)
+    written = {number: np.asarray(value, types[number][1]) for number, value in literals}
     # What depends on constants alone is the same at all sub-steps of a tick.
     moving, once, always = set(inputs), list[Any](), list[Any]()
     for step in steps:
-        _, operands, number, _ = step
+        _, operands, number = step
         changes = not moving.isdisjoint(operands)
         (always if changes else once).append(step)
         if changes:
             moving.add(number)
 
-    def bind(constants: list[np.ndarray]) -> BatchLaw:
-        fixed = dict(enumerate(constants)) | written
-        _evaluate(once, fixed)
+    def evaluate(steps: list[Any], values: dict[int, np.ndarray]) -> None:
+        """Add to `values` what `steps` make of them."""
+        for kind, operands, number in steps:
+            arguments = [values[operand] for operand in operands]
+            if kind in _SAME:
+                values[number] = arguments[0].astype(types[number][1], copy=False)
+            else:
+                values[number] = OPERATIONS[kind][0](*arguments)
+
+    def bind(values: list[np.ndarray]) -> BatchLaw:
+        fixed = {k: value.reshape(len(value), -1) for k, value in enumerate(values)} | written
+        evaluate(once, fixed)
 
         def law(substep: int, position: np.ndarray, velocity: np.ndarray) -> list[np.ndarray]:
             values = fixed | dict(zip(inputs, (np.asarray(substep, np.int32), position, velocity), strict=True))
-            _evaluate(always, values)
+            evaluate(always, values)
             return [values[number] for number in results]
 
         return law
 
     return bind
-
-
-def _evaluate(steps: list[Any], values: dict[int, np.ndarray]) -> None:
-    """Add to `values` what `steps` make of them."""
-    for kind, operands, number, parameter in steps:
-        arguments = [values[operand] for operand in operands]
-        if kind == "broadcast_in_dim":
-            values[number] = _broadcast(arguments[0], *parameter)
-        elif kind == "convert_element_type":
-            values[number] = arguments[0].astype(parameter)
-        elif kind == "reshape":
-            values[number] = arguments[0].reshape(arguments[0].shape[:1] + tuple(parameter))
-        else:
-            values[number] = OPERATIONS[kind][0](*_aligned(arguments))
-
-
-def _aligned(values: list[np.ndarray]) -> list[np.ndarray]:
-    """A scalar of each environment [B] beside vectors [B, J] needs an axis; JAX broadcasts scalars by itself."""
-    rank = max(value.ndim for value in values)
-    return [
-        value.reshape(value.shape + (1,) * (rank - value.ndim)) if 0 < value.ndim < rank else value for value in values
-    ]
-
-
-def _broadcast(value: np.ndarray, shape: list[int], axes: list[int]) -> np.ndarray:
-    batch = value.shape[:1] or (1,)
-    own = [1] * len(shape)
-    for axis, length in zip(axes, value.shape[1:], strict=True):
-        own[axis] = length
-    return np.broadcast_to(value.reshape(batch + tuple(own)), batch + tuple(shape))

@@ -19,15 +19,7 @@ import numpy as np
 from mujoco import mjx
 
 from dexsim.core.errors import AssetError
-from dexsim.objects.params import ObjectParams
-from dexsim.physics.interface import (
-    ContactParams,
-    ImplicitLaw,
-    PhysicsScene,
-    PhysicsState,
-    StepResult,
-    configured,
-)
+from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, configured
 
 
 class MjxBackend:
@@ -45,11 +37,9 @@ class MjxBackend:
         self._finger_of_geom = np.array([fingers.get(int(body), -1) for body in model.geom_bodyid])
         self._is_object_geom = np.isin(np.arange(model.ngeom), scene.object_geoms)
 
-    def advance(
-        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
-    ) -> StepResult:
+    def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick by MJX."""
-        scene, model = self.scene, self.model.replace(**configured(self.scene, object, contacts))
+        scene, model = self.scene, self.model.replace(**configured(self.scene, fields))
         wrench = jnp.zeros((scene.model.nbody, 6)).at[scene.object_body, :3].set(push)
         data = mjx.make_data(self.model).replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, xfrc_applied=wrench

@@ -6,6 +6,7 @@ tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device).
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +17,12 @@ from dexsim.core.install import install_line
 from dexsim.core.pytree import choose
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose
-from dexsim.objects.params import ObjectParams
+from dexsim.objects.params import ObjectParams, bounding_radius
 from dexsim.physics import contact
 from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.backend import CudaBackend
-from dexsim.physics.interface import (
-    Backend,
-    ContactParams,
-    PhysicsScene,
-    PhysicsState,
-    StepResult,
-    TorqueLaw,
-    configured,
-)
+from dexsim.physics.interface import Backend, Fields, PhysicsScene, PhysicsState, StepResult, TorqueLaw, configured
 from dexsim.physics.law import implicit
 from dexsim.physics.model import build_scene
 
@@ -121,13 +114,13 @@ class Physics:
           object: the object.
           state: where to start from.
           push: [3] N, force on the object's centre of mass during the whole tick.
-          tip_stiffness, pad_thickness_delta: see `contact_params`.
+          tip_stiffness, pad_thickness_delta: see `fields`.
           held: [] bool, whether somebody holds the object: weightless, it is where it was at the end; None for no.
         """
         if held is not None:
             push = jnp.where(held, -object.mass * jnp.asarray(self.mj_model.opt.gravity, jnp.float32), push)
-        contacts = self.contact_params(object, tip_stiffness, pad_thickness_delta)
-        result = self.engine.advance(object, contacts, state, implicit(law, self.config.timestep), push)
+        fields = self.fields(object, tip_stiffness, pad_thickness_delta)
+        result = self.engine.advance(fields, state, implicit(law, self.config.timestep), push)
         if held is None:
             return result
         still = dataclasses.replace(
@@ -137,35 +130,46 @@ class Physics:
         )
         return result._replace(state=choose(held, still, result.state))
 
-    def configure(
+    def fields(
         self,
         object: ObjectParams,
         tip_stiffness: jax.Array | None = None,
         pad_thickness_delta: jax.Array | float = 0.0,
-    ) -> dict[str, jax.Array]:
-        """What the model of one environment has in place of the scene's, by the names of `mujoco.MjModel`; arguments
-        as in `contact_params`."""
-        return configured(self.scene, object, self.contact_params(object, tip_stiffness, pad_thickness_delta))
-
-    def contact_params(
-        self,
-        object: ObjectParams,
-        tip_stiffness: jax.Array | None = None,
-        pad_thickness_delta: jax.Array | float = 0.0,
-    ) -> ContactParams:
-        """Contact parameters of an object.
+    ) -> Fields:
+        """What one environment has in place of the scene's.
 
         Args:
           object: the object.
           tip_stiffness: [F] the fingertips' stiffness over the nominal one (`tip_stiffness`); None for 1.
           pad_thickness_delta: [] m, change of the thickness of their rubber from `PhysicsConfig.pad_thickness`.
         """
-        friction = object.pair_friction(self._finger_of_pair >= 0)
+        scene, delta = self.scene, self._delta(pad_thickness_delta)
+        friction = jnp.where(self._finger_of_pair >= 0, object.friction, object.link_friction)
         share = jnp.asarray(self._share)
         if tip_stiffness is not None:
             share *= jnp.append(tip_stiffness, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
         solref, solimp = contact.spring(self._compliance, share * object.contact[0], object.contact[1])
-        return ContactParams(friction, solref, solimp, self._delta(pad_thickness_delta))
+        tips = scene.model.geom_size[scene.tip_geoms] + delta * scene.tip_growth
+        # The broad phase leaves out what is farther away. Of thinner rubber the sphere round it may stay.
+        around = scene.model.geom_rbound[scene.tip_geoms]
+        around = around + jnp.maximum(delta, 0.0) * np.linalg.norm(scene.tip_growth, axis=-1)
+        aligned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(scene.slots), 1))
+        return {
+            "geom_size": jnp.concatenate([object.size, tips]),
+            "geom_rbound": jnp.concatenate([bounding_radius(object.size, scene.slots), around]),
+            "geom_pos": object.position,
+            "geom_quat": aligned if object.quat is None else object.quat,
+            "body_mass": object.mass,
+            "body_inertia": object.inertia,
+            "body_ipos": object.com,
+            "pair_friction": jnp.stack([friction] * 2, -1),
+            "pair_solref": solref,
+            "pair_solimp": solimp,
+        }
+
+    def configure(self, object: ObjectParams, *changes: Any) -> dict[str, jax.Array]:
+        """The whole fields of one environment's model, by the names of `mujoco.MjModel`; arguments as in `fields`."""
+        return configured(self.scene, self.fields(object, *changes))
 
     def tip_stiffness(
         self,

@@ -135,8 +135,7 @@ class Simulation:
     ) -> State:
         """A step after which the page's changes hold: what they do is seen in the next observation."""
         tips, links = bare
-        links = None if links is None else links * friction
-        object = dataclasses.replace(state.episode.object, friction=tips * friction, link_friction=links)
+        object = dataclasses.replace(state.episode.object, friction=tips * friction, link_friction=links * friction)
         dofs = self.env.physics.object_dof[:3]
         physics = dataclasses.replace(state.physics, qvel=state.physics.qvel.at[dofs].add(push))
         goal = state.goal

@@ -70,7 +70,7 @@ def compile_scene(
         )
         for name in names:
             tip = spec.geom(name).parent.name in tips
-            slide = target.friction if tip or target.link_friction is None else target.link_friction
+            slide = target.friction if tip else target.link_friction
             spec.add_pair(
                 geomname1=name,
                 geomname2=KINDS[k],

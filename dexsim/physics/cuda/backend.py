@@ -4,25 +4,14 @@ The kernel is generated for the scene and for the motor law, which it evaluates 
 program is traced. Its solver runs until it has converged, and its results repeat to the bit.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.errors import ConfigError
-from dexsim.objects.params import ObjectParams
 from dexsim.physics.cuda import launch
 from dexsim.physics.cuda.law import PrintedLaw, print_law
 from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
 from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
-from dexsim.physics.interface import (
-    ContactParams,
-    ImplicitLaw,
-    PhysicsScene,
-    PhysicsState,
-    StepResult,
-    values,
-)
+from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, without_gradient
 from dexsim.physics.law import record
 
 # Newton's method stops at this decrement at least, and its line search at this share of it: forces are then as near to
@@ -43,25 +32,20 @@ class CudaBackend:
         self.scene = scene
         kernel_constants(scene), find_compiler(), launch.architecture()
         self._loaded: dict[PrintedLaw, str] = {}
-        self._tick = jax.custom_jvp(self._call, nondiff_argnums=(0,))
-        self._tick.defjvp(_no_gradient)
+        self._tick = without_gradient("cuda", self._call, 1)
 
-    def advance(
-        self, object: ObjectParams, contacts: ContactParams, state: PhysicsState, law: ImplicitLaw, push: jax.Array
-    ) -> StepResult:
+    def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick in one launch."""
         joints = len(self.scene.joint_dof)
         recorded = record(law, jnp.zeros(joints))
         name, moving = self._load(print_law(recorded, joints)), (state.qpos, state.qvel, state.warmstart)
-        constant = self._inputs(object, contacts, push)
+        constant = self._inputs(fields, push)
         qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *constant, *map(jnp.asarray, recorded.constants))
         return StepResult(PhysicsState(qpos, qvel, warmstart), force)
 
-    def _inputs(self, object: ObjectParams, contacts: ContactParams, push: jax.Array) -> list[jax.Array]:
+    def _inputs(self, fields: Fields, push: jax.Array) -> list[jax.Array]:
         """What of a tick stays the same, in the order of the kernel's buffers."""
-        inputs = values(self.scene, object, contacts) | {"push": push, "pair_friction": contacts.friction}
-        if "geom_quat" not in inputs:
-            inputs["geom_quat"] = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(self.scene.slots), 1))
+        inputs = fields | {"push": push, "pair_friction": fields["pair_friction"][:, 0]}
         names = [buffer.name for buffer in buffers(self.scene, ()) if not buffer.output][3:]
         return [jnp.asarray(inputs[name], jnp.float32) for name in names]
 
@@ -85,7 +69,3 @@ class CudaBackend:
     def _call(self, name: str, *arguments: jax.Array) -> list[jax.Array]:
         shapes = [array.shape for array in arguments[:3]] + [(self.scene.hand.num_fingers, 3), (4,)]
         return launch.call(name, [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arguments)
-
-
-def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'cuda' has no gradient")

@@ -24,39 +24,33 @@ _MAJOR, _MINOR = 75, 76
 _DATA = ffi.Buffer.data.offset
 
 
-class Driver:
-    """The CUDA driver's functions; a call that fails raises."""
-
-    def __init__(self):
-        """Raises ConfigError: there is none."""
-        try:
-            self._library = ctypes.CDLL("libcuda.so.1")
-        except OSError:
-            raise ConfigError("backend 'cuda' needs NVIDIA's driver, with libcuda.so.1") from None
-        self.call("cuInit", 0)
-
-    def call(self, name: str, *arguments: Any) -> None:
-        """Call a function.
-
-        Raises:
-          RuntimeError: with the driver's text for the error that it returns.
-        """
-        if code := getattr(self._library, name)(*arguments):
-            text = ctypes.c_char_p()
-            self._library.cuGetErrorString(code, ctypes.byref(text))
-            raise RuntimeError(f"backend 'cuda': {name}: {(text.value or b'error').decode()} ({code})")
-
-    def attribute(self, which: int, device: int) -> int:
-        """`cuDeviceGetAttribute`."""
-        value = ctypes.c_int()
-        self.call("cuDeviceGetAttribute", ctypes.byref(value), which, device)
-        return value.value
-
-
 @functools.cache
-def driver() -> Driver:
-    """The driver, loaded once. Raises ConfigError: there is none."""
-    return Driver()
+def _library() -> ctypes.CDLL:
+    try:
+        library = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        raise ConfigError("backend 'cuda' needs NVIDIA's driver, with libcuda.so.1") from None
+    library.cuInit(0)  # what fails here fails in every call
+    return library
+
+
+def driver(name: str, *arguments: Any) -> None:
+    """Call a function of the CUDA driver.
+
+    Raises:
+      ConfigError: there is no driver.
+      RuntimeError: with its text for the error that it returns.
+    """
+    if code := getattr(_library(), name)(*arguments):
+        text = ctypes.c_char_p()
+        _library().cuGetErrorString(code, ctypes.byref(text))
+        raise RuntimeError(f"backend 'cuda': {name}: {(text.value or b'error').decode()} ({code})")
+
+
+def _attribute(which: int, device: int) -> int:
+    value = ctypes.c_int()
+    driver("cuDeviceGetAttribute", ctypes.byref(value), which, device)
+    return value.value
 
 
 @functools.cache
@@ -66,9 +60,7 @@ def architecture() -> str:
     Raises:
       ConfigError: they differ.
     """
-    kinds = {
-        f"sm_{driver().attribute(_MAJOR, device)}{driver().attribute(_MINOR, device)}" for device in _local_devices()
-    }
+    kinds = {f"sm_{_attribute(_MAJOR, device)}{_attribute(_MINOR, device)}" for device in _local_devices()}
     if len(kinds) != 1:
         raise ConfigError(
             f"backend 'cuda': expected GPUs of one kind, got {', '.join(sorted(kinds))}: set CUDA_VISIBLE_DEVICES"
@@ -93,32 +85,31 @@ class Kernel:
         """
         self.settings, self._code, self._args = settings, code, args_type(buffers)
         self.library, self.function = ctypes.c_void_p(), ctypes.c_void_p()
-        driver().call("cuLibraryLoadData", ctypes.byref(self.library), code, None, None, 0, None, None, 0)
-        driver().call("cuLibraryGetKernel", ctypes.byref(self.function), self.library, ENTRY.encode())
+        driver("cuLibraryLoadData", ctypes.byref(self.library), code, None, None, 0, None, None, 0)
+        driver("cuLibraryGetKernel", ctypes.byref(self.function), self.library, ENTRY.encode())
         for device in _local_devices():
             self.shared = WORLDS_PER_BLOCK * self._load(device)
-            if self.shared > (most := driver().attribute(_MOST_SHARED, device)):
+            if self.shared > (most := _attribute(_MOST_SHARED, device)):
                 raise ConfigError(
                     f"backend 'cuda': {WORLDS_PER_BLOCK} worlds need {self.shared} bytes of shared memory, "
                     f"of which GPU {device} gives a block {most}"
                 )
             for which, value in ((_DYNAMIC_SHARED, self.shared), (_CARVEOUT, 100)):
-                driver().call("cuKernelSetAttribute", which, value, self.function, device)
+                driver("cuKernelSetAttribute", which, value, self.function, device)
 
     def _load(self, device: int) -> int:
         """Load the code on a GPU now, since it must not be during a capture. Returns a world's shared memory, bytes."""
         context, old, function = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
         address, size, shared = ctypes.c_uint64(), ctypes.c_size_t(), ctypes.c_uint()
-        cuda = driver()
-        cuda.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)  # XLA's, which keeps it
-        cuda.call("cuCtxPushCurrent_v2", context)
+        driver("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)  # XLA's, which keeps it
+        driver("cuCtxPushCurrent_v2", context)
         try:
-            cuda.call("cuKernelGetFunction", ctypes.byref(function), self.function)
+            driver("cuKernelGetFunction", ctypes.byref(function), self.function)
             name = SHARED_BYTES.encode()
-            cuda.call("cuLibraryGetGlobal", ctypes.byref(address), ctypes.byref(size), self.library, name)
-            cuda.call("cuMemcpyDtoH_v2", ctypes.byref(shared), address, ctypes.c_size_t(ctypes.sizeof(shared)))
+            driver("cuLibraryGetGlobal", ctypes.byref(address), ctypes.byref(size), self.library, name)
+            driver("cuMemcpyDtoH_v2", ctypes.byref(shared), address, ctypes.c_size_t(ctypes.sizeof(shared)))
         finally:
-            cuda.call("cuCtxPopCurrent_v2", ctypes.byref(old))
+            driver("cuCtxPopCurrent_v2", ctypes.byref(old))
         return shared.value
 
     def launch(self, stream: int, worlds: int, pointers: Sequence[int]) -> None:
@@ -129,7 +120,7 @@ class Kernel:
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(args))
         blocks, threads = -(-worlds // WORLDS_PER_BLOCK), WORLDS_PER_BLOCK * 32
         grid, launch = (blocks, 1, 1, threads, 1, 1, self.shared, ctypes.c_void_p(stream)), (parameters, None)
-        driver().call("cuLaunchKernel", self.function, *grid, *launch)
+        driver("cuLaunchKernel", self.function, *grid, *launch)
 
 
 # By the names that programs have for them. They stay: a program may run when its environment is gone.

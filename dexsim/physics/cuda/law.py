@@ -1,22 +1,18 @@
 """A recorded torque law (`dexsim.physics.law`) as CUDA: a function of one joint.
 
-A law works element by element on scalars and on vectors over the joints, so one joint's torque takes one element of
-each. The order of operations is the recorded one; the compiler may fuse a product and a sum, as XLA does.
+The order of operations is the recorded one; the compiler may fuse a product and a sum, as XLA does.
 """
 
 import dataclasses
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
-from dexsim.core.errors import ConfigError
 from dexsim.physics.cuda.scene import Buffer
 from dexsim.physics.law import OPERATIONS, Recorded
 
 _CTYPES = {"float32": "float", "int32": "int", "bool": "bool"}
-_BOOLEAN = {"and", "or", "not", "eq", "ne", "ge", "gt", "le", "lt"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,49 +30,22 @@ def print_law(law: Recorded, joints: int) -> PrintedLaw:
 
     Args:
       law: as recorded.
-      joints: J; every array of the law is [J] or [].
-
-    Raises:
-      ConfigError: the law has arrays of another shape or type.
+      joints: J.
     """
-    shapes, types, names = dict[int, tuple[int, ...]](), dict[int, str](), dict[int, str]()
-
-    def add(number: int, name: str, shape: tuple[int, ...], dtype: str) -> None:
-        if shape not in ((), (joints,)) or dtype not in _CTYPES:
-            raise ConfigError(
-                f"backend 'cuda': the motor law has an array {list(shape)} {dtype}: "
-                f"expected [] or [{joints}], {', '.join(_CTYPES)}"
-            )
-        names[number], shapes[number], types[number] = name, shape, dtype
-
-    buffers = []
-    for number, constant in enumerate(law.constants):
-        shape = np.shape(constant)
-        place = f"[world * {joints} + joint]" if shape else "[world]"
-        add(number, f"args.law_{number}{place}", shape, str(jax.dtypes.result_type(constant)))
-        buffers.append(Buffer(f"law_{number}", math.prod(shape), ctype=_CTYPES[types[number]]))
-    first = len(law.constants)
-    add(first, "substep", (), "int32")
-    add(first + 1, "position", (joints,), "float32")
-    add(first + 2, "velocity", (joints,), "float32")
-    for number, value, dtype in law.literals:
-        add(number, _literal(value, dtype), (), dtype)
-
+    names, buffers = dict[int, str](), []
+    count = len(law.constants)
+    for number, (vector, dtype) in enumerate(law.types[:count]):
+        place = f"[world * {joints} + joint]" if vector else "[world]"
+        names[number] = f"args.law_{number}{place}"
+        buffers.append(Buffer(f"law_{number}", joints if vector else 1, ctype=_CTYPES[dtype]))
+    names |= {count: "substep", count + 1: "position", count + 2: "velocity"}
+    names |= {number: _literal(value, law.types[number][1]) for number, value in law.literals}
     lines = []
-    for kind, operands, number, parameter in law.steps:
-        shape, dtype = max((shapes[operand] for operand in operands), key=len), types[operands[-1]]
-        if kind == "broadcast_in_dim":
-            shape = tuple(parameter[0])
-        elif kind == "reshape":
-            shape = tuple(parameter)
-        elif kind == "convert_element_type":
-            dtype = parameter
-        elif kind in _BOOLEAN:
-            dtype = "bool"
-        add(number, f"v{number}", shape, dtype)
+    for kind, operands, number in law.steps:
+        names[number] = f"v{number}"
         _, expression = OPERATIONS.get(kind, (None, "{0}"))
         value = expression.format(*(names[operand] for operand in operands))
-        lines.append(f"  const {_CTYPES[dtype]} v{number} = {value};\n")
+        lines.append(f"  const {_CTYPES[law.types[number][1]]} v{number} = {value};\n")
     return PrintedLaw(
         "DEV Motor motor_law(const Args &args, int world, int joint, int substep, float position, float velocity) {\n"
         f"{''.join(lines)}  return {{{names[law.torque]}, {names[law.inertia]}}};\n}}\n",

@@ -12,7 +12,8 @@ zero.
 import ctypes
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -230,22 +231,23 @@ def kernel_constants(scene: PhysicsScene) -> str:
     )
 
 
+def _number(value: float) -> str:
+    """A C++ literal of a float32."""
+    return f"{np.float32(value):.9e}f"
+
+
 def _array(name: str, values: ArrayLike, kind: str = "float") -> str:
     """A C++ table [...] of device memory."""
     array = np.asarray(values)
     sizes = "".join(f"[{n}]" for n in array.shape)
-
-    def braces(part: np.ndarray) -> str:
-        if part.ndim:
-            return "{" + ", ".join(braces(row) for row in part) + "}"
-        return _number(part.item()) if kind == "float" else str(part.item())
-
-    return f"__device__ const {kind} {name}{sizes} = {braces(array)};"
+    return f"__device__ const {kind} {name}{sizes} = {_list(array, _number if kind == 'float' else str)};"
 
 
-def _number(value: float) -> str:
-    """A C++ literal of a float32."""
-    return f"{np.float32(value):.9e}f"
+def _list(values: ArrayLike, literal: Callable[[Any], str] = _number) -> str:
+    """The braces of an array [...] of float32, or of what else `literal` prints."""
+    if np.ndim(values):
+        return "{" + ", ".join(_list(row, literal) for row in np.asarray(values)) + "}"
+    return literal(np.asarray(values).item())
 
 
 def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
@@ -361,14 +363,12 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
         row = rows.get(pair, -1 - len(springs))
         if row < 0:
             springs.append([model.pair_friction[pair, 0], *model.pair_solref[pair], *model.pair_solimp[pair]])
-        lines.append(f"  {{{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}}},")
+        lines.append(f"{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}")
     return [
         "// Links (the object's last), row among the object's pairs (or -1 - that among the others), finger whose tip",
         "// presses on the object, -1 where the object is the pair's first, inverse weights of both bodies in 1/kg.",
         "struct Pair { int first, second, row, finger; float side, compliance; };",
-        f"__device__ const Pair PAIR[{len(lines)}] = {{",
-        *lines,
-        "};",
+        *_table("Pair", "PAIR", lines),
         _array("HAND_SPRING", np.array(springs or np.zeros((1, 8)))),
     ]
 
@@ -390,10 +390,6 @@ def _lanes(values: ArrayLike, fill: float = 0.0) -> np.ndarray:
     """Values [H, ...] for all lanes [32, ...]."""
     array = np.asarray(values)
     return np.concatenate([array, np.full((LANES - len(array), *array.shape[1:]), fill, array.dtype)])
-
-
-def _list(values: Iterable[float]) -> str:
-    return "{" + ", ".join(map(_number, values)) + "}"
 
 
 def _spread(centre: np.ndarray) -> np.ndarray:
@@ -486,8 +482,7 @@ def _contacts(scene: PhysicsScene, links: Links) -> list[str]:
         round_rows.append(f"{at}, {link}, {_list(half * turn[:, 2])}, {radius}, {sized.get(geom, -1)}")
     for geom in geoms["box"]:
         at, link, turn = place(geom)
-        axes = ", ".join(_list(row) for row in turn)
-        box_rows.append(f"{at}, {link}, {{{axes}}}, {_list(model.geom_size[geom])}, {sized.get(geom, -1)}")
+        box_rows.append(f"{at}, {link}, {_list(turn)}, {_list(model.geom_size[geom])}, {sized.get(geom, -1)}")
     for geom in geoms["plane"]:
         at, _, turn = place(geom)
         plane_rows.append(f"{at}, {_list(turn[:, 2])}")

@@ -1,10 +1,8 @@
 """The grasp task's evaluation report: catch rate, hold time, commanded against measured force."""
 
-from collections.abc import Callable
-
 import numpy as np
 
-from dexsim.core.statistics import bootstrap, entry, mean, proportion, statistic
+from dexsim.core.statistics import entry, interval, mean, proportion
 from dexsim.force_loop import target_force
 from dexsim.objects.config import KINDS
 
@@ -13,7 +11,7 @@ FORCES = {"r_resultant": "force", "r_normal": "normal", "r_taxels": "taxels"}
 """Correlations with the command, and what of the contact force each takes: all of it with friction, what of it presses
 into the skin, and what of that the taxels bear. The metric is `finger_` and this."""
 _COMMANDED = tuple(f"finger_{part}" for part in FORCES.values())
-_MEANS = ("total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited")
+_MEANS = ("total_force", "total_torque", "touching", "torque_limited")
 _UNITS = {"total_torque": "total_torque", "touching": "touching_fingers", "torque_limited": "torque_limited"}
 """Names of what is not in N, by metric."""
 
@@ -42,12 +40,11 @@ def summarize(
     Returns:
       A JSON-able dict. Forces are averaged over the ticks of "window_s", for episodes held to the end. "finger_..." are
       means over the touching fingers but the thumb, of which the command speaks; "total_force" is the solver's force
-      summed over all fingers, "taxel_force" that sum as the taxels feel it. "total_torque" is the sum over touching
-      fingers of the root joint's torque as a share of its limit, "torque_limited" the share of ticks with a joint at
-      its limit: there force cannot follow. "r_..." correlate the command with the commanded force (`FORCES`) and the
-      torque, "slope_..." are least-squares slopes over it. "force_error_n" is the root mean square error of the
-      resultant over all episodes; a lost object is not pressed. Intervals are 95 %: Wilson's for proportions, else
-      bootstrap over episodes.
+      summed over all fingers. "total_torque" is the sum over touching fingers of the root joint's torque as a share of
+      its limit, "torque_limited" the share of ticks with a joint at its limit: there force cannot follow. "r_..."
+      correlate the command with the commanded force (`FORCES`) and the torque, "slope_..." are least-squares slopes
+      over it. "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not
+      pressed. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
     held, command, shape = alive[-1], metrics["command"][0], metrics["shape"][0].astype(int)
@@ -84,7 +81,6 @@ def summarize(
         "seconds": ticks * control_period,
         "window_s": list(window(ticks * control_period)),
         "held": proportion(held),
-        "hold_time_s": mean(alive.sum(0) * control_period),
         **correlations(command, held, commanded),
         "r_torque": pearson(command[held], late_means["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
@@ -126,7 +122,8 @@ def correlations(command: np.ndarray, held: np.ndarray, commanded: dict[str, np.
 
 def force_error(values: np.ndarray, target: np.ndarray) -> dict:
     """Root mean square error with a bootstrap 95 % interval."""
-    return statistic((values - target) ** 2, lambda square: np.sqrt(square.mean()), "mean")
+    square = (values - target) ** 2
+    return interval(lambda rows: np.sqrt(square[rows].mean()), square.size)
 
 
 def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
@@ -136,21 +133,14 @@ def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
         a, b = x[rows], y[rows]
         return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else np.nan
 
-    return _interval("r", correlate, x.size, samples, x.size >= 3 and x.std() > 0 and y.std() > 0)
+    return interval(correlate, x.size if x.size >= 3 else 0, "r", samples)
 
 
-def slope(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
+def slope(x: np.ndarray, y: np.ndarray) -> dict:
     """Least-squares slope of y over x with a bootstrap 95 % interval; None where it is undefined."""
 
     def fit(rows: np.ndarray | slice) -> float:
         off = x[rows] - x[rows].mean()
         return float(off @ y[rows] / (off @ off)) if off.any() else np.nan
 
-    return _interval("mean", fit, x.size, samples, x.size >= 3 and x.std() > 0)
-
-
-def _interval(name: str, function: Callable, count: int, samples: int, defined: bool) -> dict:
-    if not defined:
-        return {name: None, "low": None, "high": None}
-    low, high = bootstrap(function, count, samples)
-    return {name: function(slice(None)), "low": low, "high": high}
+    return interval(fit, x.size if x.size >= 3 else 0)

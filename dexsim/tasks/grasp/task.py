@@ -258,8 +258,7 @@ class Grasp(Task):
     def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
         force = length(truth.finger_force)
         contact = force > _CONTACT
-        pressing = jnp.sum(truth.touch.force, -1)
-        parts = {"force": force, "normal": truth.normal_force, "taxels": pressing}
+        parts = {"force": force, "normal": truth.normal_force, "taxels": jnp.sum(truth.touch.force, -1)}
         commanded = {f"finger_{name}": commanded_force(part, contact) for name, part in parts.items()}
         return {
             "success": held,
@@ -270,12 +269,9 @@ class Grasp(Task):
             "total_torque": jnp.sum(
                 jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
             ),
-            "taxel_force": jnp.sum(pressing),
-            "thumb_force": force[0],
             "touching": jnp.sum(contact).astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
-            **{f"force/{i}": force[i] for i in range(force.shape[0])},
         }
 
     # --- evaluation ------------------------------------------------------------------------

@@ -85,10 +85,6 @@ class TestPure:
         assert not np.array_equal(first.episode.hand.encoder_bias, other.episode.hand.encoder_bias)
         assert len(np.unique(first.episode.hand.encoder_bias[:, 0])) == WORLDS
 
-    def test_keys_advance(self, history):
-        data = [np.asarray(jax.random.key_data(state.key)) for state, _, _ in history]
-        assert len(np.unique(np.concatenate(data), axis=0)) == WORLDS * len(history)
-
 
 class TestTick:
     def test_a_tick_equals_c_mujoco(self, hand, grasp_env, grasp_rollout):

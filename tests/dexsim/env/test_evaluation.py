@@ -7,33 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from episodes import reset_to
-from simple_physics import SimplePhysics
 
-import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.evaluation import Evaluation, evaluation_of
 from dexsim.env.state import Start
-from dexsim.objects.config import ObjectConfig
-from dexsim.tasks.grasp.config import GraspConfig
 
 MANY = 400
-OBJECTS = ObjectConfig(shapes=("box", "sphere"), extremes=0.5)
 
 
 @pytest.fixture(scope="module")
-def env():
-    """Grasp over simple physics, with a pool of eight objects of which some are extreme."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-    yield dexsim.make("grasp", GraspConfig(pool_size=8, objects=OBJECTS), backend="mjx")
-    patch.undo()
-
-
-@pytest.fixture(scope="module")
-def drawn(env):
+def drawn(simple_env):
     """The objects of `MANY` episodes from each row of the pool: leaves [8, MANY, ...]."""
-    reset = jit(jax.vmap(jax.vmap(lambda key, row: reset_to(env)(key, row).episode.object, (0, None))), once=True)
+    reset = jit(
+        jax.vmap(jax.vmap(lambda key, row: reset_to(simple_env)(key, row).episode.object, (0, None))), once=True
+    )
     return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
 
 
@@ -51,20 +39,20 @@ def spans(config):
 
 
 class TestProperties:
-    def test_inertia_follows_mass_and_shape(self, env, drawn):
+    def test_inertia_follows_mass_and_shape(self, simple_env, drawn):
         """A box's is m/3 (b^2 + c^2); every ratio to it lies in the range, the same for all three axes."""
         boxes = np.flatnonzero(np.asarray(drawn.shape_index)[:, 0] == 1)
         square = np.asarray(drawn.size)[boxes, :, 0] ** 2
         uniform = np.asarray(drawn.mass)[boxes, :, None] / 3 * (square.sum(-1, keepdims=True) - square)
         ratio = np.asarray(drawn.inertia)[boxes] / uniform
         np.testing.assert_allclose(ratio, ratio[..., :1].repeat(3, -1), rtol=1e-4)
-        low, high = env.config.objects.inertia_scale
+        low, high = simple_env.config.objects.inertia_scale
         assert low - 1e-4 <= ratio.min() < low + 0.02 and high - 0.02 < ratio.max() <= high + 1e-4
 
-    def test_extreme_objects_stay_extreme_at_ends_of_their_own(self, env, drawn):
-        extreme = np.asarray(env.pool.object.extreme)
+    def test_extreme_objects_stay_extreme_at_ends_of_their_own(self, simple_env, drawn):
+        extreme = np.asarray(simple_env.pool.object.extreme)
         assert 0 < extreme.sum() < 8
-        low, high = spans(env.config.objects).T
+        low, high = spans(simple_env.config.objects).T
         place = (properties(drawn) - low) / (high - low)
         at_end = np.isclose(place, 0, atol=1e-4) | np.isclose(place, 1, atol=1e-4)
         assert np.all(at_end[extreme]) and np.mean(at_end[~extreme]) < 0.01
@@ -110,11 +98,11 @@ class TestPlan:
         assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
 
     @pytest.mark.slow
-    def test_a_slice_of_a_plan_gives_its_episodes(self, env):
+    def test_a_slice_of_a_plan_gives_its_episodes(self, simple_env):
         """Of the real task: more episodes than its pool has rows, all from starts of their own."""
-        protocol = evaluation_of(env)
+        protocol = evaluation_of(simple_env)
         plan = protocol.evaluation_plan(12, 0)
-        assert len(rows_of(plan.start.qpos) - rows_of(env.pool.qpos)) == 12
+        assert len(rows_of(plan.start.qpos) - rows_of(simple_env.pool.qpos)) == 12
         starts = jit(protocol.evaluation_starts, once=True)
         first, second = (starts(jax.tree.map(lambda leaf, i=i: leaf[i : i + 4], plan)) for i in (2, 4))
         np.testing.assert_array_equal(first.physics.qpos, plan.start.qpos[2:6])

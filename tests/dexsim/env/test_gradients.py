@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from simple_physics import SimplePhysics
 
-import dexsim
 from dexsim.core.compilation import jit
 from dexsim.geometry.vectors import length
-from dexsim.objects.config import ObjectConfig
-from dexsim.tasks.grasp.config import GraspConfig
 
 WORLDS = 8
 
@@ -29,22 +25,13 @@ def test_a_length_is_the_norm_and_its_gradient_the_direction(vector):
         np.testing.assert_allclose(gradient, vector / norm, rtol=1e-5, atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def env():
-    """Grasp over simple physics, where fingers that have not closed feel a force of exactly zero."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        objects = ObjectConfig(shapes=("sphere",))
-        yield dexsim.make("grasp", GraspConfig(pool_size=4, objects=objects), backend="mjx")
-
-
 @pytest.mark.slow
-def test_gradients_are_finite_while_fingers_touch_nothing(env):
+def test_gradients_are_finite_while_fingers_touch_nothing(simple_env):
     """Of rewards, forces and observations over ten steps with one action [12], from an object moved by [3]."""
 
     def total(action, shift, state):
         def tick(state, _):
-            state = env.step(state, action)
+            state = simple_env.step(state, action)
             shown = jnp.sum(state.obs["actor"]) + jnp.sum(state.obs["critic"])
             return state, (state.reward + jnp.sum(state.finger_force) + shown, state.finger_force)
 
@@ -54,7 +41,7 @@ def test_gradients_are_finite_while_fingers_touch_nothing(env):
         return jnp.sum(outcome), force
 
     actions = 0.3 * jax.random.normal(jax.random.key(1), (WORLDS, 12))
-    states = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
+    states = jit(jax.vmap(simple_env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
     slope = jit(jax.vmap(jax.grad(total, argnums=(0, 1), has_aux=True)), once=True)
     gradient, force = jax.device_get(slope(actions, jnp.zeros((WORLDS, 3)), states))
     assert np.any(force == 0) and np.any(force > 0), "free fingers and pressing ones are needed"

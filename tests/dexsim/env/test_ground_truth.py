@@ -1,48 +1,44 @@
 """The frames of what reward and critic see of the object's motion, against C MuJoCo's own integration."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from episodes import ground_truth
-from simple_physics import SimplePhysics
 
-import dexsim
 from dexsim import observation
-from dexsim.objects.config import ObjectConfig
+from dexsim.env.observer import Observer
 from dexsim.observation import Readings
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import revert_if_diverged
-from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.grasp.task import Grasp
 
 MOMENT = 1e-6  # s
 FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="100"/></body></worldbody></mujoco>"""
 
 
 @pytest.fixture(scope="module")
-def env():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        critic = (*observation.GRASP, "object_orientation", "object_spin")
-        patch.setattr(Grasp, "fields", {"actor": observation.GRASP, "critic": critic})
-        config = GraspConfig(pool_size=4, objects=ObjectConfig(shapes=("sphere",)))
-        yield dexsim.make("grasp", config, backend="mjx")
+def observer(simple_env):
+    """Grasp's, whose critic also sees the object's orientation and spin."""
+    critic = (*observation.GRASP, "object_orientation", "object_spin")
+    task = SimpleNamespace(fields={"actor": observation.GRASP, "critic": critic})
+    return Observer(simple_env.config, simple_env.hand, task)
 
 
 @pytest.fixture(scope="module")
-def seen(env):
+def seen(simple_env, observer):
     """The object's velocity and spin as a task sees them, and the critic's observation, from a physics state."""
-    object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], env.pool.object)
+    object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], simple_env.pool.object)
     upright, joints, nothing = jnp.array([1.0, 0, 0, 0]), jnp.zeros(12), jnp.zeros(3)
     readings = Readings(
         joints, joints, jnp.zeros((5, 120)), nothing, nothing, upright, upright, jnp.float32(0.5), joints
     )
 
     def look(physics):
-        truth = ground_truth(env, object, physics, jnp.zeros((5, 3)))
-        critic = env.observer.observe(readings, truth, (jnp.float32(0.5), upright))["critic"]
+        truth = ground_truth(simple_env, object, physics, jnp.zeros((5, 3)))
+        critic = observer.observe(readings, truth, (jnp.float32(0.5), upright))["critic"]
         return (truth.object_velocity, truth.object_spin), critic
 
     return jax.jit(look)
@@ -54,17 +50,18 @@ def turned(quat):
     return matrix.reshape(3, 3)
 
 
-def field(env, group, name, values):
+def field(observer, name, values):
+    """A field of the critic's observation."""
     at = 0
-    for entry in env.observation_layout[group]:
+    for entry in observer.layout["critic"]:
         if entry.name == name:
             return values[at : at + entry.size]
         at += entry.size
-    raise AssertionError(f"{group} does not observe {name}")
+    raise AssertionError(f"the critic does not observe {name}")
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_velocity_and_spin_are_the_objects_change_in_the_palm_frame(env, seen, seed):
+def test_velocity_and_spin_are_the_objects_change_in_the_palm_frame(observer, seen, seed):
     """The engine has the spin in the object's own frame; reward and critic have both in the palm frame."""
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=4)
@@ -86,10 +83,10 @@ def test_velocity_and_spin_are_the_objects_change_in_the_palm_frame(env, seen, s
     found, critic = seen(physics)
     np.testing.assert_allclose(found[0], velocity, atol=1e-5)
     np.testing.assert_allclose(found[1], spin, atol=1e-4)
-    np.testing.assert_allclose(field(env, "critic", "object_velocity", critic), velocity, atol=1e-5)
-    np.testing.assert_allclose(field(env, "critic", "object_spin", critic), spin, atol=1e-4)
+    np.testing.assert_allclose(field(observer, "object_velocity", critic), velocity, atol=1e-5)
+    np.testing.assert_allclose(field(observer, "object_spin", critic), spin, atol=1e-4)
     orientation = turned(place[3:])[:, :2].T.ravel()
-    np.testing.assert_allclose(field(env, "critic", "object_orientation", critic), orientation, atol=1e-5)
+    np.testing.assert_allclose(field(observer, "object_orientation", critic), orientation, atol=1e-5)
 
 
 @pytest.mark.parametrize(

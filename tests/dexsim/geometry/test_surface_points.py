@@ -9,12 +9,6 @@ from shapes import bounds, solid
 
 from dexsim.geometry import mesh, sdf, surface_points
 
-SIZES = {
-    "sphere": (0.03, 0, 0),
-    "box": (0.025, 0.02, 0.03),
-    "capsule": (0.013, 0.025, 0),
-    "cylinder": (0.02, 0.025, 0),
-}
 FEW = 300
 nearest = jax.jit(surface_points.nearest)
 

@@ -392,7 +392,7 @@ def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compile
 
 def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
     """C MuJoCo leaves out contacts of geoms whose bounding spheres are apart."""
-    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], pad_thickness_delta=THICK - THIN)
+    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], None, THICK - THIN)
     size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
     assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)

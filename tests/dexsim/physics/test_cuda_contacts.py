@@ -16,7 +16,7 @@ from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 
-WORLDS = 300
+WORLDS = 120
 CONTACT = np.dtype([("gap", "f4"), ("point", "f4", 3), ("normal", "f4", 3), ("pair", "i4")], align=True)
 # Geoms of a hand, each on a link of its own but for the plane; `tip` and `block` have their sizes from the world.
 HAND = {
@@ -268,7 +268,7 @@ def test_contacts_are_those_of_c_mujoco(slots, first, second):
     contacts = [row[:number][row[:number]["pair"] == pair] for row, number in zip(contacts, count, strict=True)]
     assert np.mean([len(contacts) > 0 for contacts in expected]) > 0.6
     close = [close_to(*both) for both in zip(expected, contacts, strict=True)]
-    assert np.mean(close) > 0.995
+    assert np.sum(~np.array(close)) <= 1
 
 
 def crowd(slots: tuple[str, ...], seed: int) -> World:

@@ -152,6 +152,7 @@ def test_gradients_in_a_pinch_are_finite_differences(physics):
         inertia=jnp.array([5e-5, 5e-5, 2e-5]),
         com=jnp.zeros(3),
         friction=jnp.float32(0.0),
+        link_friction=jnp.float32(0.0),
         contact=jnp.array([1700.0, 1.0]),
         kinds=("capsule",),
     )

@@ -1,9 +1,12 @@
 """The grasp report on synthetic evaluations: arrays [T, N] whose answers are known beforehand."""
 
+import functools
+
 import numpy as np
 import pytest
 from scipy import stats
 
+from dexsim.core import statistics
 from dexsim.tasks.grasp import report
 
 PERIOD = 0.1  # s
@@ -34,8 +37,6 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "torque_limited": flat * (command == 1.0),
         "total_force": 3 * force,
         "total_torque": 0.2 * force,
-        "taxel_force": 2 * force,
-        "thumb_force": flat * 0.5,
         "touching": flat * 3,
         "return": flat * 7.0,
         "joint_speed": np.where(alive, 0.1, 0.0),
@@ -63,15 +64,14 @@ class TestSummary:
     @pytest.fixture(autouse=True)
     def few_draws(self, monkeypatch):
         """The intervals are tested above; here they only cost time."""
-        bootstrap = report.bootstrap
-        monkeypatch.setattr(
-            report, "bootstrap", lambda statistic, count, samples: bootstrap(statistic, count, min(samples, 10))
-        )
+        few = functools.partial(statistics.interval, samples=10)
+        for module in (statistics, report):
+            monkeypatch.setattr(module, "interval", lambda function, count, name="mean", *_: few(function, count, name))
 
     def test_a_perfect_follower(self):
         found = report.summarize(*evaluation(noise=1e-3), PERIOD, SPAN)
         assert found["episodes"] == 200 and found["seconds"] == pytest.approx(6.0)
-        assert found["held"]["mean"] == 1.0 and found["hold_time_s"]["mean"] == pytest.approx(6.0)
+        assert found["held"]["mean"] == 1.0
         assert found["r_resultant"]["r"] > 0.9999 and found["force_error_n"]["mean"] < 2e-3
         assert found["non_finite"] == 0
 
@@ -83,18 +83,15 @@ class TestSummary:
             assert row["finger_force_n"]["mean"] == pytest.approx(target)
             assert row["total_force_n"]["mean"] == pytest.approx(3 * target)
             assert row["target_force_n"] == pytest.approx(target)
-            assert row["taxel_force_n"]["mean"] == pytest.approx(2 * target)
-            assert row["thumb_force_n"]["mean"] == pytest.approx(0.5)
             assert row["touching_fingers"]["mean"] == pytest.approx(3.0)
 
     def test_lost_episodes(self):
         """Every 4th episode is lost at 2 s; nothing they felt counts."""
         metrics, alive = evaluation(lost=range(0, 200, 4))
-        for name in ("finger_force", "total_force", "taxel_force"):
+        for name in ("finger_force", "total_force"):
             metrics[name][:, ::4] = 1e6
         found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["held"]["mean"] == 0.75
-        assert found["hold_time_s"]["mean"] == pytest.approx(0.75 * 6 + 0.25 * 2)
         assert found["joint_speed_rad_s"]["mean"] == pytest.approx(0.1), "of the ticks that an episode lived"
         forces = [row["finger_force_n"]["mean"] for row in found["by_command"]]
         assert forces == pytest.approx([1, 2, 3, 4, 5])
