@@ -7,15 +7,14 @@ moved until its readings are the log's (`dexsim.identification.search`).
 import dataclasses
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import stdtrit
 
 from dexsim.core.errors import CalibrationError
-from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
+from dexsim.identification.joint import PARAMETERS, JointLog
 from dexsim.identification.search import CHI2, Search
 
-_LEAST_GROUPS = 3  # segments below which their differences are not part of an interval
+_LEAST_GROUPS, _PARTS = 3, 20  # segments below which a log is cut into equal parts
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -62,17 +61,12 @@ class Identification:
     """rad, of the angles fitted to."""
     torque_rmse: float
     """Nm; NaN without torques."""
-    holdout_rmse: float
-    """rad, on a log that was not fitted to; NaN without one."""
-    holdout_rmse_before: float
-    """rad, on the same log with the values that the search began with."""
     notes: tuple[str, ...]
 
     def report(self) -> str:
         """A table for people."""
-        rmse, after, before = (1e3 * error for error in (self.rmse, self.holdout_rmse, self.holdout_rmse_before))
         rows = [
-            f"{self.joint}: rmse {rmse:.2f} mrad, hold-out {after:.2f} mrad (before {before:.2f})",
+            f"{self.joint}: rmse {1e3 * self.rmse:.2f} mrad",
             f"{'parameter':18}{'value':>12}{'95 % from':>12}{'to':>12}  unit",
         ]
         for name in self.fitted:
@@ -93,7 +87,6 @@ def identify(
     substeps: int = 3,
     latencies: tuple[int, ...] = tuple(range(9)),
     dead_band: tuple[float, float] | None = (0.0, 0.03),
-    holdout: JointLog | None = None,
 ) -> Identification:
     """Fit one joint.
 
@@ -105,38 +98,38 @@ def identify(
         step that the parameters will be used with.
       latencies: candidates, sub-steps; one of them alone fixes it.
       dead_band: range to search, rad, or None to keep the value in `start`.
-      holdout: another recording with the same period, best with other signals, to test on.
 
     Raises:
       CalibrationError: says what is wrong with the log or what to record.
     """
-    for recording in (log,) if holdout is None else (log, holdout):
-        check_log(recording)
+    check_log(log)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
-    latency, theta, count = search.latency, search.theta, search.count
-    fitted = search.names[:count]
+    latency, theta, fitted = search.latency, search.theta, search.names
     residual = search.residual(theta, search.starts)
     intervals, correlation, unidentifiable = _intervals(search, residual)
-    first = {name: float(value) for name, value in search.fixed.items()}
-    values = first | dict(zip(search.names, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
+    values = {name: float(value) for name, value in search.fixed.items()}
+    values |= dict(zip(fitted, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
     margin = 1e-3 * _size(search)
-    at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
-    at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
+    at_end = (theta <= search.low + margin) | (theta >= search.high - margin)
+    at_bound = tuple(name for name, hit in zip(fitted, at_end, strict=True) if hit)
     # All from the solution and with the weights found last: costs under other weights cannot be compared.
     cost = {}
     for search.latency in sorted(latencies):
         cost[search.latency] = search.solve(theta, 10)[0]
-    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
+    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - len(theta), 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
-    before = after = float("nan")
-    if holdout is not None:
-        before, _ = evaluate(holdout, first, latency=latency, substeps=substeps)
-        after, _ = evaluate(holdout, values, latency=latency, substeps=substeps)
     rmse = np.sqrt(np.mean((residual.reshape(search.measured.shape) * search.noise[:, None]) ** 2, -1))
     notes = [MODEL, *(_GROUP.format(", ".join(group)) for group in unidentifiable)]
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
-    notes += _notes(log, latency, latencies, plausible, before, after)
+    if len(latencies) > 1 and latency == max(latencies):
+        notes.append("latency is the largest that was tried: try more")
+    if latency not in plausible:
+        others = ", ".join(map(str, plausible))
+        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
+    speed = np.gradient(log.position)
+    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
+        notes.append("the joint went one way only: friction and offsets are not apart")
     return Identification(
         joint=log.name,
         values=values,
@@ -150,15 +143,13 @@ def identify(
         at_bound=at_bound,
         rmse=float(rmse[0]),
         torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
-        holdout_rmse=after,
-        holdout_rmse_before=before,
         notes=tuple(notes),
     )
 
 
 def _size(search: Search) -> np.ndarray:
     """What counts as a relative change of 1 of each fitted parameter."""
-    return np.maximum(np.abs(search.theta), search.typical)[: search.count]
+    return np.maximum(np.abs(search.theta), search.typical)
 
 
 def _intervals(
@@ -168,22 +159,20 @@ def _intervals(
 
     From the curvature at the best point, widened by what was seen to fit as well farther off.
     """
-    theta, count, size = search.theta[: search.count], search.count, _size(search)
-    jacobian = search.jacobian(search.theta, search.starts)
-    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
+    theta, count, size = search.theta, len(search.theta), _size(search)
+    jacobian = search.jacobian(theta, search.starts)
     sizes = np.append(size, np.full(len(search.starts), 0.05))
-    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
+    half, correlation, null = uncertainty(jacobian, residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     least, largest = search.plausible()
-    low = np.maximum(np.minimum(theta - half, least[:count]), search.low[:count])
-    high = np.minimum(np.maximum(theta + half, largest[:count]), search.high[:count])
+    low = np.maximum(np.minimum(theta - half, least), search.low)
+    high = np.minimum(np.maximum(theta + half, largest), search.high)
     if search.dead_band is not None:
-        first, last = search.dead_band_profile(search.dead_band)
+        first, last = search.dead_band_profile()
         low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
-    fitted = search.names[:count]
-    intervals = {name: (float(a), float(b)) for name, a, b in zip(fitted, low, high, strict=True)}
-    return intervals, correlation, _groups(fitted, null, correlation, half, size)
+    intervals = {name: (float(a), float(b)) for name, a, b in zip(search.names, low, high, strict=True)}
+    return intervals, correlation, _groups(search.names, null, correlation, half, size)
 
 
 def uncertainty(
@@ -191,10 +180,13 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
+    The wider of two intervals counts: that of independent residuals, and a jackknife over the segments, one Newton step
+    each. What the model gets wrong differs from signal to signal, and residuals of one signal go together.
+
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
       size: [P], what counts as a relative change of 1.
-      segment: [T] int, parts of the log that began at rest; residuals of one part belong together.
+      segment: [T] int, parts of the log that began at rest. Fewer than `_LEAST_GROUPS` are cut into `_PARTS` parts.
 
     Returns:
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
@@ -205,37 +197,25 @@ def uncertainty(
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
     inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    freedom = max(len(residual) - len(size), 1)
-    white = inverse * np.sum(residual**2) / freedom
-    score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)
-    robust = inverse @ _long_run(score) @ inverse * len(residual) / freedom
-    # Whichever is larger: the robust one is itself a guess and falls short in half of all cases.
-    half = _NORMAL * np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
-    half = np.maximum(half, _between_segments(relative, score, segment)) * size
+    white = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
     spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
+    if len(np.unique(segment)) < _LEAST_GROUPS:
+        segment = np.arange(len(segment)) * _PARTS // len(segment)
+    rows = relative.reshape(-1, len(segment), len(size))
+    score = (relative * residual[:, None]).reshape(rows.shape).sum(0)
+    moved = []
+    for part in np.unique(segment):
+        own = rows[:, segment == part].reshape(-1, len(size))
+        left = np.linalg.pinv(relative.T @ relative - own.T @ own, rcond=_NULL**2, hermitian=True)
+        moved.append(left @ score[segment == part].sum(0))
+    count = len(moved)
+    jackknife = stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
+    half = np.maximum(_NORMAL * spread, jackknife) * size
     correlation = white / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
-
-
-def _between_segments(relative: np.ndarray, score: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Half of the 95 % intervals [P] by the jackknife over segments, one Newton step each.
-
-    What the model gets wrong differs from signal to signal, which no autocorrelation shows.
-    """
-    rows = relative.reshape(-1, len(segment), relative.shape[1])
-    parts = [np.einsum("ctp,ctq->pq", rows[:, segment == k], rows[:, segment == k]) for k in np.unique(segment)]
-    count, whole = len(parts), np.sum(parts, 0)
-    if count < _LEAST_GROUPS:
-        return np.zeros(len(whole))
-    scores = [score[segment == k].sum(0) for k in np.unique(segment)]
-    moved = [
-        np.linalg.pinv(whole - part, rcond=_NULL**2, hermitian=True) @ own
-        for part, own in zip(parts, scores, strict=True)
-    ]
-    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
 
 
 def _groups(
@@ -256,40 +236,6 @@ def _groups(
     return tuple(dict.fromkeys(sets))
 
 
-def _notes(
-    log: JointLog, latency: int, latencies: tuple[int, ...], plausible: tuple[int, ...], before: float, after: float
-) -> list[str]:
-    notes = []
-    if len(latencies) > 1 and latency == max(latencies):
-        notes.append("latency is the largest that was tried: try more")
-    if latency not in plausible:
-        others = ", ".join(map(str, plausible))
-        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
-    speed = np.gradient(log.position)
-    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
-        notes.append("the joint went one way only: friction and offsets are not apart")
-    if np.isfinite(after) and after > 0.9 * before:
-        notes.append(
-            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
-        )
-    return notes
-
-
-def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> tuple[float, float]:
-    """Root mean square errors of the angle, rad, and of the torque, Nm (NaN without), on a log.
-
-    Where the joint rests, the simulation begins anew from the angle in the log (`segments`).
-    """
-    segment, angle = segments(log)
-    full = with_defaults(dict(values), log)
-    full["start"] = jnp.asarray(angle[segment], jnp.float32) - full["encoder_bias"]
-    timestep, target = jnp.float32(log.period / substeps), jnp.asarray(log.target, jnp.float32)
-    position, torque = simulate(full, target, jnp.int32(latency), timestep, substeps, segment)
-    measured = np.nan if log.torque is None else log.torque
-    angle_error, torque_error = np.asarray(position, float) - log.position, np.asarray(torque, float) - measured
-    return float(np.sqrt(np.mean(angle_error**2))), float(np.sqrt(np.mean(torque_error**2)))
-
-
 def check_log(log: JointLog) -> None:
     """Refuse a log that cannot tell.
 
@@ -303,48 +249,28 @@ def check_log(log: JointLog) -> None:
             f"{log.name}: got {', '.join(map(str, shapes))}; expected arrays of one length, at least {MIN_SAMPLES} "
             "samples of chirp, steps, slow triangles and small reversals"
         )
-    if not np.all(np.isfinite(channels)):
-        raise CalibrationError(
-            f"{log.name}: a sample is not a number: cut the log there, samples must follow each other without gaps"
-        )
-    if not 1e-4 <= log.period <= 0.2:
-        raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 to 0.2")
-    largest = max(np.abs(log.position).max(), np.abs(log.target).max())
-    if largest > 2 * np.pi:
-        raise CalibrationError(f"{log.name}: angles of {largest:.3g}: give rad, not degrees or counts")
-    moved, commanded = np.ptp(log.position), np.ptp(log.target)
-    if min(moved, commanded) < MIN_MOTION or not 1 / 20 < moved / commanded < 20:
-        raise CalibrationError(
-            f"{log.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of "
-            "motion is needed, target and position in the same unit"
-        )
-    size = np.zeros(1) if log.torque is None else np.abs(log.torque)
-    if size.max() > 50.0:
-        raise CalibrationError(f"{log.name}: torque of {size.max():.3g} Nm: give Nm")
-    if log.torque is not None and np.mean(size > 0.97 * size.max()) > 0.6:
-        raise CalibrationError(
-            f"{log.name}: torque sits at {size.max():.3g} Nm in most samples: saturated, give smaller commands"
-        )
-
-
-def _long_run(score: np.ndarray) -> np.ndarray:
-    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T: Newey-West on the series without
-    its first-order autoregression (Andrews and Monahan 1992), bandwidth after Andrews 1991."""
-    count = len(score)
-    rho = _autocorrelation(score)
-    white = score[1:] - rho * score[:-1]
-    left = _autocorrelation(white)
-    alpha = float(np.max(4 * left**2 / ((1 - left) * (1 + left)) ** 2))
-    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)) + 1, count // 4)
-    total = white.T @ white
-    for lag in range(1, lags + 1):
-        cross = white[lag:].T @ white[:-lag]
-        total += (1.0 - lag / (lags + 1)) * (cross + cross.T)
-    return total / np.outer(1.0 - rho, 1.0 - rho) * count / (count - 1)
-
-
-def _autocorrelation(series: np.ndarray) -> np.ndarray:
-    """First-order coefficient [P] of each column, corrected for its bias in short series. Correlation over more than a
-    quarter of the series is not to be told from a trend."""
-    rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
-    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))
+    target, position = log.target, log.position
+    moved, commanded = np.ptp(position), np.ptp(target)
+    largest = np.max(np.abs([target, position]))
+    torque = np.zeros(1) if log.torque is None else np.abs(log.torque)
+    strongest = torque.max()
+    for wrong, says in (
+        (
+            not np.all(np.isfinite(channels)),
+            "a sample is not a number: cut the log there, samples must follow each other without gaps",
+        ),
+        (not 1e-4 <= log.period <= 0.2, f"period of {log.period:g} s: give seconds, from 0.0001 to 0.2"),
+        (largest > 2 * np.pi, f"angles of {largest:.3g}: give rad, not degrees or counts"),
+        (
+            min(moved, commanded) < MIN_MOTION or not commanded / 20 < moved < 20 * commanded,
+            f"commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of motion is "
+            "needed, target and position in the same unit",
+        ),
+        (strongest > 50.0, f"torque of {strongest:.3g} Nm: give Nm"),
+        (
+            strongest > 0 and np.mean(torque > 0.97 * strongest) > 0.6,
+            f"torque sits at {strongest:.3g} Nm in most samples: saturated, give smaller commands",
+        ),
+    ):
+        if wrong:
+            raise CalibrationError(f"{log.name}: {says}")

@@ -20,9 +20,8 @@ from dexsim.hand.description import Hand
 from dexsim.identification.excitation import Excitation, excitation
 from dexsim.identification.identify import Identification, identify
 from dexsim.identification.joint import JointLog
-from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.bench import Bench, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.read import Source, read_logs
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
@@ -33,12 +32,8 @@ from dexsim_real.wire.identity import check_identity
 
 TASK = "identify"
 Marks = list[dict[str, Any]]
-"""Annotated exchanges of one joint and signal, in the order of time."""
+"""Annotated exchanges of one joint, in the order of time."""
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
-_SIGNALS: dict[str, dict[str, Any]] = {
-    "fit": {},
-    "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
-}
 _TIMESTEP = 0.006  # s, about that of the simulation
 _TARE = 0.5  # s
 _LOST = 0.02  # share of the exchanges, or of the time, that may be missing
@@ -56,13 +51,11 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
     results, failed = [], dict[str, DexsimError]()
     source, recorded = read_joints(logs, hand, calibration)
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    for name, signals in recorded.items():
+    for name, marks in recorded.items():
         if arguments.joints and name not in arguments.joints:
             continue
         try:
-            log, holdout = (
-                joint_log(name, marks, hand, source, calibration) for marks in (signals["fit"], signals["hold-out"])
-            )
+            log = joint_log(name, marks, hand, source, calibration)
             joint = hand.joint_names.index(name)
             start = {
                 "stiffness": STIFFNESS,
@@ -76,7 +69,6 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 start,
                 substeps=max(round(log.period / _TIMESTEP), 1),
                 dead_band=(0.0, 0.03) if arguments.dead_band else None,
-                holdout=holdout,
             )
         except DexsimError as error:
             failed[name] = error
@@ -103,11 +95,8 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     posture = np.full(hand.num_joints, 0.5)  # rad, about which every joint can move without a collision
     posture[:4] = 0.5, 0.4, 0.5, 0.0
     posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
-    signals = {
-        label: excitation(hand, Excitation(period=period, **options), posture, arguments.joints or None)
-        for label, options in _SIGNALS.items()
-    }
-    seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
+    signals = excitation(hand, Excitation(period=period), posture, arguments.joints or None)
+    seconds = sum(len(targets) * period + 1.5 for targets in signals.values())
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep clear of them")
     with stopping(), Bench(arguments, hand, operator, TASK, **bench) as work:
         try:
@@ -115,22 +104,19 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             if not operator.assume_yes and operator.ask("  Enter starts, s stops:", work.step).lower() in ("s", "stop"):
                 raise HandError("stopped before anything moved")
             work.await_motors()
-            for name in signals["fit"]:
+            for name, targets in signals.items():
                 operator.tell(name)
-                for label, targets in signals.items():
-                    work.move(targets[name][0])
-                    for target in targets[name]:
-                        measured = work.step(target) is not None  # An angle that cannot be true is none.
-                        work.annotate({"joint": name, "signal": label, "measured": measured})
+                work.move(targets[0])
+                for target in targets:
+                    measured = work.step(target) is not None  # An angle that cannot be true is none.
+                    work.annotate({"joint": name, "measured": measured})
         finally:  # A signal that comes just before this line is followed by the close of the bench.
             work.close()
     return work.log.path
 
 
-def read_joints(
-    paths: Iterable[Path], hand: Hand, calibration: Calibration | None
-) -> tuple[Source, dict[str, dict[str, Marks]]]:
-    """How logs of one hand were recorded, and the exchanges by joint and signal; a joint is taken from its last log.
+def read_joints(paths: Iterable[Path], hand: Hand, calibration: Calibration | None) -> tuple[Source, dict[str, Marks]]:
+    """How logs of one hand were recorded, and the exchanges by joint; a joint is taken from its last log.
 
     Raises:
       LogError: not a log of an identification, or of another hand or configuration than the logs before.
@@ -139,17 +125,17 @@ def read_joints(
     source, logs = read_logs(paths, TASK)
     if calibration is not None:
         check_identity(source.identity, hand, calibration)
-    recorded: dict[str, dict[str, Marks]] = {}
+    recorded: dict[str, Marks] = {}
     for records in logs:
-        own: dict[str, dict[str, Marks]] = {}
+        own: dict[str, Marks] = {}
         for mark in (record.content for record in records if record.kind == Kind.TICK):
-            own.setdefault(mark["joint"], {label: [] for label in _SIGNALS})[mark["signal"]].append(mark)
+            own.setdefault(mark["joint"], []).append(mark)
         recorded |= own
     return source, recorded
 
 
 def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
-    """The samples of a joint in one signal; without a calibration its torques are unknown.
+    """The samples of a joint; without a calibration its torques are unknown.
 
     Raises:
       LogError: too many exchanges are missing, or they took longer than their period.

@@ -11,7 +11,7 @@ import scipy.stats
 
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import Excitation, excitation, joint_excitation
-from dexsim.identification.identify import FIT, check_log, evaluate, identify, uncertainty
+from dexsim.identification.identify import FIT, check_log, identify, uncertainty
 from dexsim.identification.joint import PARAMETERS, JointLog, simulate, with_defaults
 
 PERIOD, SUBSTEPS = 0.015, 3
@@ -30,9 +30,6 @@ GUESS = dict(stiffness=3.5, damping=0.13, stall_torque=0.45, no_load_speed=12.0,
 TARGET = joint_excitation(Excitation(period=PERIOD), 0.9, 0.8)
 SHORT = joint_excitation(
     Excitation(period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, reversal_cycles=2, rest=0.3), 0.9, 0.8
-)
-HOLDOUT = joint_excitation(
-    Excitation(period=PERIOD, amplitude=0.2, chirp_frequency=(0.5, 2.5), step_count=3, chirp_seconds=3.0), 1.0, 0.8
 )
 
 
@@ -89,18 +86,6 @@ def test_parameters_come_back_in_90_of_100():
     for name in trials[0][0]:
         assert sum(inside[name] for inside, _ in trials) >= 90, name
     assert sum(bool(wide) for _, wide in trials) <= 5
-
-
-@pytest.mark.slow
-def test_holdout_and_report():
-    holdout = log_of(TRUTH, 7, target=HOLDOUT)
-    result = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
-    assert result.holdout_rmse < 0.0013 and result.holdout_rmse_before > 0.003
-    direct = evaluate(holdout, result.values, latency=2, substeps=SUBSTEPS)
-    assert direct[0] == pytest.approx(result.holdout_rmse) and direct[1] < 0.02
-    for word in ("stiffness", "dead_band", "latency", "hold-out", "mrad"):
-        assert word in result.report()
-    np.testing.assert_allclose(np.diag(result.correlation), np.ones(6))
 
 
 @pytest.mark.parametrize("noise", [0.001, 2e-4])
@@ -269,7 +254,6 @@ def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
         (dict(fit=("dead_band",)), "cannot fit 'dead_band'"),
         (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
         (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside"),
-        (dict(holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10])), "at least 200 samples"),
     ],
 )
 def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
