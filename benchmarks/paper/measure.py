@@ -171,7 +171,6 @@ def trials(skill: str, policy: str, seed: int, budget_name: str) -> dict[str, An
         "seed": [seed],
         "parameters": "outside",
         "seconds": budget.seconds.get(skill),
-        "safety": True,
         "set": {},
         "limit": {},
     }

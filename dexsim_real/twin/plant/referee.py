@@ -75,7 +75,7 @@ class Referee:
         self._step = thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
-        self._force, self._duty, self._speed = np.zeros(fingers), np.zeros(fingers), 0.0
+        self._force, self._speed = np.zeros(fingers), 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
         self._heading: float | None = None  # rad, at the release
@@ -109,7 +109,6 @@ class Referee:
         self.time += step
         touching = forces["force"] > TOUCH
         self._speed += step * float(np.mean(np.abs(joint_speed)))
-        self._duty += step * touching
         if touching.any():
             self._touched = self.time
         away = float(np.linalg.norm(position - self._reference))
@@ -176,7 +175,6 @@ class Referee:
         report: dict[str, Any] = {
             "seconds": round(self.time, 4),
             "end": self.end or "running",
-            "duty": np.round(self._duty / lived, 4).tolist(),
             "joint_speed": round(self._speed / lived, 4),
         }
         if self.end.startswith("dropped") and self._moments:

@@ -12,10 +12,16 @@ from dexsim.calibration.maps import calibrated_hand, joint_torque, load_calibrat
 from dexsim.core.errors import CalibrationError
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
-from dexsim_real.calibrate.force_scale import dead_taxels, fill_dead, force_scale
+from dexsim_real.calibrate.bench import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.press_fit import fit, torque_constant_intervals, torque_constants
+from dexsim_real.calibrate.press_fit import (
+    dead_taxels,
+    fill_dead,
+    fit,
+    force_scale,
+    torque_constant_intervals,
+    torque_constants,
+)
 from dexsim_real.calibrate.read import Recording, Source, read_presses
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 from dexsim_real.sensors.hand import HardwareConfig
