@@ -161,6 +161,6 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     torque = None
     if calibration is not None:
-        current = state["current"].astype(float) * calibration.current_per_count
+        current = 1e-3 * state["current"].astype(float)  # A
         torque = np.interp(rows, rows[given], np.array(joint_torque(calibration, current))[:, joint])
     return JointLog(period, target, np.interp(rows, rows[given], position), torque, name)

@@ -26,7 +26,7 @@ from dexsim_real.twin.plant.parameters import (
     TrialParameters,
     sample_trial,
 )
-from dexsim_real.twin.plant.referee import Referee
+from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
@@ -315,18 +315,19 @@ class EmulatedHand:
         scene, data, dof, at = self._scene, self._data, self._scene.object_dof, self._scene.object_qpos
         quat = data.qpos[at + 3 : at + 7].copy()
         force, normal = tip_forces(self._touches, self.hand.num_fingers)
-        taxels = self._samples[-1][1][..., 2].sum(-1)
-        self._referee.watch(
-            self._look_every * self._period,
-            data.qpos[at : at + 3].copy(),
-            quat,
-            matrix(quat) @ data.qvel[dof + 3 : dof + 6],
-            {"force": np.linalg.norm(force, axis=-1), "normal": normal, "taxels": taxels},
-            self.true_pose()[0],
-            data.qvel[scene.drive_dof],
-            self._drives.at_limit(),
-            bool(self._pushes.last.any()),
+        look = Look(
+            position=data.qpos[at : at + 3].copy(),
+            quat=quat,
+            spin=float((matrix(quat) @ data.qvel[dof + 3 : dof + 6])[0]),
+            force=np.linalg.norm(force, axis=-1),
+            normal=normal,
+            taxels=self._samples[-1][1][..., 2].sum(-1),
+            joint_position=self.true_pose()[0],
+            joint_speed=data.qvel[scene.drive_dof],
+            limited=bool(self._drives.at_limit().any()),
+            disturbed=bool(self._pushes.last.any()),
         )
+        self._referee.watch(self._look_every * self._period, look)
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
             self._referee.end = "dropped: the physics failed"
         if self._referee.end:

@@ -10,7 +10,7 @@ import pytest
 from emulated_plant import free
 from paths import ROOT
 
-from dexsim.calibration.maps import current_from_counts, normalised_torque
+from dexsim.calibration.maps import normalised_torque
 from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
@@ -115,10 +115,8 @@ def test_the_camera_measures_the_height(hand):
 
 def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
     calibration = ideal_calibration(hand)
-    counts = -1000.0 * 0.5 * np.ones(12)  # mA, closing, half of what stalls
-    assert np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts))) == pytest.approx(
-        np.full(12, 0.5), abs=1e-6
-    )
+    current = -0.5 * np.ones(12, np.float32)  # A, closing, half of what stalls
+    assert np.asarray(normalised_torque(calibration, current)) == pytest.approx(np.full(12, 0.5), abs=1e-6)
     assert HardwareConfig().current_sign < 0
 
 
