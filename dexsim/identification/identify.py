@@ -14,7 +14,7 @@ from dexsim.core.errors import CalibrationError
 from dexsim.identification.joint import PARAMETERS, JointLog
 from dexsim.identification.search import CHI2, Search
 
-_LEAST_GROUPS, _PARTS = 3, 20  # segments below which a log is cut into equal parts
+_LEAST_GROUPS = 3  # segments below which their differences are not part of an interval
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -105,19 +105,20 @@ def identify(
     check_log(log)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
-    latency, theta, fitted = search.latency, search.theta, search.names
+    latency, theta, count = search.latency, search.theta, search.count
+    fitted = search.names[:count]
     residual = search.residual(theta, search.starts)
     intervals, correlation, unidentifiable = _intervals(search, residual)
     values = {name: float(value) for name, value in search.fixed.items()}
-    values |= dict(zip(fitted, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
+    values |= dict(zip(search.names, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
     margin = 1e-3 * _size(search)
-    at_end = (theta <= search.low + margin) | (theta >= search.high - margin)
-    at_bound = tuple(name for name, hit in zip(fitted, at_end, strict=True) if hit)
+    at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
+    at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
     # All from the solution and with the weights found last: costs under other weights cannot be compared.
     cost = {}
     for search.latency in sorted(latencies):
         cost[search.latency] = search.solve(theta, 10)[0]
-    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - len(theta), 1))
+    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     rmse = np.sqrt(np.mean((residual.reshape(search.measured.shape) * search.noise[:, None]) ** 2, -1))
     notes = [MODEL, *(_GROUP.format(", ".join(group)) for group in unidentifiable)]
@@ -149,7 +150,7 @@ def identify(
 
 def _size(search: Search) -> np.ndarray:
     """What counts as a relative change of 1 of each fitted parameter."""
-    return np.maximum(np.abs(search.theta), search.typical)
+    return np.maximum(np.abs(search.theta), search.typical)[: search.count]
 
 
 def _intervals(
@@ -159,20 +160,22 @@ def _intervals(
 
     From the curvature at the best point, widened by what was seen to fit as well farther off.
     """
-    theta, count, size = search.theta, len(search.theta), _size(search)
-    jacobian = search.jacobian(theta, search.starts)
+    theta, count, size = search.theta[: search.count], search.count, _size(search)
+    jacobian = search.jacobian(search.theta, search.starts)
+    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
     sizes = np.append(size, np.full(len(search.starts), 0.05))
-    half, correlation, null = uncertainty(jacobian, residual, sizes, search.segment)
+    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     least, largest = search.plausible()
-    low = np.maximum(np.minimum(theta - half, least), search.low)
-    high = np.minimum(np.maximum(theta + half, largest), search.high)
+    low = np.maximum(np.minimum(theta - half, least[:count]), search.low[:count])
+    high = np.minimum(np.maximum(theta + half, largest[:count]), search.high[:count])
     if search.dead_band is not None:
-        first, last = search.dead_band_profile()
+        first, last = search.dead_band_profile(search.dead_band)
         low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
-    intervals = {name: (float(a), float(b)) for name, a, b in zip(search.names, low, high, strict=True)}
-    return intervals, correlation, _groups(search.names, null, correlation, half, size)
+    fitted = search.names[:count]
+    intervals = {name: (float(a), float(b)) for name, a, b in zip(fitted, low, high, strict=True)}
+    return intervals, correlation, _groups(fitted, null, correlation, half, size)
 
 
 def uncertainty(
@@ -180,13 +183,10 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
-    The wider of two intervals counts: that of independent residuals, and a jackknife over the segments, one Newton step
-    each. What the model gets wrong differs from signal to signal, and residuals of one signal go together.
-
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
       size: [P], what counts as a relative change of 1.
-      segment: [T] int, parts of the log that began at rest. Fewer than `_LEAST_GROUPS` are cut into `_PARTS` parts.
+      segment: [T] int, parts of the log that began at rest; residuals of one part belong together.
 
     Returns:
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
@@ -197,25 +197,37 @@ def uncertainty(
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
     inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    white = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
+    freedom = max(len(residual) - len(size), 1)
+    white = inverse * np.sum(residual**2) / freedom
+    score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)
+    robust = inverse @ _long_run(score) @ inverse * len(residual) / freedom
+    # Whichever is larger: the robust one is itself a guess and falls short in half of all cases.
+    half = _NORMAL * np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
+    half = np.maximum(half, _between_segments(relative, score, segment)) * size
     spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    if len(np.unique(segment)) < _LEAST_GROUPS:
-        segment = np.arange(len(segment)) * _PARTS // len(segment)
-    rows = relative.reshape(-1, len(segment), len(size))
-    score = (relative * residual[:, None]).reshape(rows.shape).sum(0)
-    moved = []
-    for part in np.unique(segment):
-        own = rows[:, segment == part].reshape(-1, len(size))
-        left = np.linalg.pinv(relative.T @ relative - own.T @ own, rcond=_NULL**2, hermitian=True)
-        moved.append(left @ score[segment == part].sum(0))
-    count = len(moved)
-    jackknife = stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
-    half = np.maximum(_NORMAL * spread, jackknife) * size
     correlation = white / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
+
+
+def _between_segments(relative: np.ndarray, score: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """Half of the 95 % intervals [P] by the jackknife over segments, one Newton step each.
+
+    What the model gets wrong differs from signal to signal, which no autocorrelation shows.
+    """
+    rows = relative.reshape(-1, len(segment), relative.shape[1])
+    parts = [np.einsum("ctp,ctq->pq", rows[:, segment == k], rows[:, segment == k]) for k in np.unique(segment)]
+    count, whole = len(parts), np.sum(parts, 0)
+    if count < _LEAST_GROUPS:
+        return np.zeros(len(whole))
+    scores = [score[segment == k].sum(0) for k in np.unique(segment)]
+    moved = [
+        np.linalg.pinv(whole - part, rcond=_NULL**2, hermitian=True) @ own
+        for part, own in zip(parts, scores, strict=True)
+    ]
+    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
 
 
 def _groups(
@@ -274,3 +286,26 @@ def check_log(log: JointLog) -> None:
     ):
         if wrong:
             raise CalibrationError(f"{log.name}: {says}")
+
+
+def _long_run(score: np.ndarray) -> np.ndarray:
+    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T: Newey-West on the series without
+    its first-order autoregression (Andrews and Monahan 1992), bandwidth after Andrews 1991."""
+    count = len(score)
+    rho = _autocorrelation(score)
+    white = score[1:] - rho * score[:-1]
+    left = _autocorrelation(white)
+    alpha = float(np.max(4 * left**2 / ((1 - left) * (1 + left)) ** 2))
+    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)) + 1, count // 4)
+    total = white.T @ white
+    for lag in range(1, lags + 1):
+        cross = white[lag:].T @ white[:-lag]
+        total += (1.0 - lag / (lags + 1)) * (cross + cross.T)
+    return total / np.outer(1.0 - rho, 1.0 - rho) * count / (count - 1)
+
+
+def _autocorrelation(series: np.ndarray) -> np.ndarray:
+    """First-order coefficient [P] of each column, corrected for its bias in short series. Correlation over more than a
+    quarter of the series is not to be told from a trend."""
+    rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
+    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))
