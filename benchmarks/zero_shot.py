@@ -84,7 +84,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
-    run = VirtualRun(plant, controller, calibration, command, limits, safety=options["safety"])
+    run = VirtualRun(plant, controller, calibration, command, limits)
     if options["task"] == "grasp":
         run.trace = []
     report = run.run()
@@ -161,11 +161,8 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")
     add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside training's ranges, or in")
     add("--plant-model", metavar="FILE", help="MJCF of another hand (docs/emulated_hand.md)")
-    add(
-        "--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter: a number or kind"
-    )
+    add("--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter")
     add("--limit", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="a safety limit of the bridge")
-    add("--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits")
     add("--no-baseline", dest="baseline", action="store_false", help="no trials of a hand that does nothing")
     add("--processes", type=_whole(1), default=1, help="trials at once")
     add("--first", type=_whole(0), default=0, help="number of the first trial")
@@ -199,11 +196,11 @@ def _whole(low: int) -> Any:
     return number
 
 
-def _pair(text: str) -> tuple[str, float | str]:
+def _pair(text: str) -> tuple[str, float]:
     name, equals, value = text.partition("=")
     if not name or not equals or value == "nan":
         raise argparse.ArgumentTypeError(f"{text}: give NAME=VALUE")
-    return name, value if value in KINDS else float(value)
+    return name, float(value)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -190,7 +190,6 @@ def trials(
         "seed": [seed],
         "parameters": "outside",
         "seconds": budget.seconds.get(skill),
-        "safety": True,
         "set": dict(given),
         "limit": {},
         "plant_model": plant_model,

@@ -27,7 +27,7 @@ from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.description import Hand
 
 FORMAT = "dexsim calibration"
-VERSION = 2
+VERSION = 3
 
 
 @pytree_dataclass
@@ -64,7 +64,6 @@ class Calibration:
     hand: str = static()
     joint_names: tuple[str, ...] = static()
     finger_names: tuple[str, ...] = static()
-    current_per_count: float = static(default=0.001)  # A; the XHand reports mA
     serial: str = static(default="")  # of the hand, as it told it; empty if it did not
     handedness: str = static(default="")  # likewise
     created: str = static(default="")
@@ -92,11 +91,6 @@ def blank_calibration(hand: Hand) -> Calibration:
 
 
 # --- run time -------------------------------------------------------------------------------
-
-
-def current_from_counts(calibration: Calibration, counts: jax.Array) -> jax.Array:
-    """Currents [J] A from what the hand reports [J] counts."""
-    return jnp.asarray(counts, jnp.float32) * calibration.current_per_count
 
 
 def joint_torque(calibration: Calibration, current: Array) -> jax.Array:
@@ -159,7 +153,6 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
 
 _WORDS = ("hand", "serial", "handedness", "created", "joint_names", "finger_names", "notes")
 _UNITS = {
-    "current_per_count": "A",
     "torque_scale": "Nm, of each joint",
     "force_per_count": "N, of each finger",
     "force_per_torque": "N/Nm, of each finger: value, 95 % low and high; 0: not pressed",
@@ -246,7 +239,6 @@ def _calibration(table: dict[str, Any]) -> Calibration:
         torque_scale=numbers(table, "torque_scale", joints),
         force_per_count=numbers(table, "force_per_count", fingers),
         force_per_torque=numbers(table, "force_per_torque", 3, fingers) if "force_per_torque" in table else None,
-        current_per_count=float(table["current_per_count"]),
         **words,
     )
 
@@ -280,8 +272,6 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand | None =
     idle = np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)  # [2, J] Nm
     force = np.zeros(0) if calibration.force_per_torque is None else np.asarray(calibration.force_per_torque)[0]
     ranges: tuple[tuple[tuple[str, ...], str, Any, float, float, str], ...] = (
-        # The wire counts mA, and runs limit the current by that. With another count, torques would not go with it.
-        ((), "current_per_count", [calibration.current_per_count], 0.99e-3, 1.01e-3, "A"),
         # The maker's is 0.1 N. Below 1 mN all 120 taxels, saturated at 255 counts, read 31 N together: less than the
         # 37 N of 1.1 Nm at a lever of 0.03 m. Above 1 N one saturated taxel reads three times what the hand gives.
         (fingers, "force_per_count", calibration.force_per_count, 1e-3, 1.0, "N"),
@@ -304,8 +294,5 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand | None =
         values = np.asarray(values)
         bad = np.argwhere(~((values >= low) & (values <= high)))  # also NaN
         if len(bad):
-            name = f"{names[bad[0][-1]]}: " if names else ""
-            raise CalibrationError(
-                f"{where}: {name}{quantity} = {values[tuple(bad[0])]:.4g}: must be between {low:.4g} and {high:.4g} "
-                f"{unit}".rstrip()
-            )
+            found = f"{names[bad[0][-1]]}: {quantity} = {values[tuple(bad[0])]:.4g}"
+            raise CalibrationError(f"{where}: {found}: must be between {low:.4g} and {high:.4g} {unit}".rstrip())

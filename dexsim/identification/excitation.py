@@ -7,6 +7,7 @@ backlash.
 import dataclasses
 
 import numpy as np
+from scipy import signal
 
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.errors import ConfigError
@@ -43,44 +44,30 @@ class Excitation(Config):
     """Small reversals, once up and down each."""
 
 
-def chirp(seconds: float, period: float, frequency: tuple[float, float]) -> np.ndarray:
-    """[T] in [-1, 1]: a sine of linearly rising frequency, Hz."""
-    time = np.arange(0.0, seconds, period)
-    low, high = frequency
-    phase = 2 * np.pi * (low * time + (high - low) * time**2 / (2 * max(seconds, period)))
-    return np.sin(phase)
-
-
-def steps(count: int, hold: float, period: float) -> np.ndarray:
-    """[T] in [-1, 1]: `count` steps to either side, full and a third in turn, `hold` s each."""
-    size = np.array([(1.0, -1.0, 1 / 3, -1 / 3)[index % 4] for index in range(count)])
-    return np.repeat(size, max(round(hold / period), 1))
-
-
-def triangles(cycles: int, cycle_seconds: float, period: float) -> np.ndarray:
-    """[T] in [-1, 1]: triangle waves from 0 up, down and back."""
-    phase = np.arange(0.0, cycles * cycle_seconds, period) / cycle_seconds % 1.0
-    return 1.0 - np.abs(4.0 * ((phase + 0.25) % 1.0) - 2.0)
-
-
 def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndarray:
     """Targets [T] rad of one joint about `middle`, no farther than `reach` from it."""
     size, period = min(config.amplitude, reach), config.period
-    small = min(_REVERSAL, reach)
-    rest = np.zeros(round(config.rest / period))
+    rest, pause = (np.zeros(round(seconds / period)) for seconds in (config.rest, _PAUSE))
     ladder = np.linspace(*config.chirp_frequency, config.chirp_parts + 1)
     fading = np.linspace(1.0, 0.25, config.chirp_parts + 1)
-    bursts = []
+    seconds = config.chirp_seconds / config.chirp_parts
+    time, bursts = np.arange(0.0, seconds, period), list[np.ndarray]()
     for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
-        wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
-        bursts += [size * strength * wave, np.zeros(round(_PAUSE / period))]
+        bursts += [size * strength * signal.chirp(time, first, max(seconds, period), second, phi=-90), pause]
+    levels = np.resize((1.0, -1.0, 1 / 3, -1 / 3), config.step_count)
     signals = [
         np.concatenate(bursts),
-        size * steps(config.step_count, _STEP, period),
-        size * triangles(1, 4 * size / _SLOW, period),
-        small * triangles(config.reversal_cycles, _REVERSAL_TIME, period),
+        size * np.repeat(levels, max(round(_STEP / period), 1)),
+        _triangles(size, 1, 4 * size / _SLOW, period),
+        _triangles(min(_REVERSAL, reach), config.reversal_cycles, _REVERSAL_TIME, period),
     ]
-    return middle + np.concatenate([rest, *(part for signal in signals for part in (signal, rest))])
+    return middle + np.concatenate([rest, *(part for wave in signals for part in (wave, rest))])
+
+
+def _triangles(size: float, cycles: int, seconds: float, period: float) -> np.ndarray:
+    """[T] rad, triangle waves of `seconds` s each, from 0 up, down and back."""
+    phase = np.arange(0.0, cycles * seconds, period) / seconds
+    return size * signal.sawtooth(2 * np.pi * (phase + 0.25), 0.5)
 
 
 def excitation(

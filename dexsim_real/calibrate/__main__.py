@@ -22,10 +22,9 @@ from dexsim.calibration.maps import save_calibration
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.description import Hand
-from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.bench import Bench, Operator
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import Fit, fit, torque_constant_intervals, torque_constants
 from dexsim_real.calibrate.procedure import PressProcedure

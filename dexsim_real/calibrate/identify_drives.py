@@ -20,9 +20,8 @@ from dexsim.hand.description import Hand
 from dexsim.identification.excitation import Excitation, excitation
 from dexsim.identification.identify import Identification, identify
 from dexsim.identification.joint import JointLog
-from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.bench import Bench, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.read import Source, read_logs
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
@@ -175,6 +174,6 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     torque = None
     if calibration is not None:
-        current = state["current"].astype(float) * calibration.current_per_count
+        current = 1e-3 * state["current"].astype(float)  # A
         torque = np.interp(rows, rows[given], np.array(joint_torque(calibration, current))[:, joint])
     return JointLog(period, target, np.interp(rows, rows[given], position), torque, name)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from dexsim.calibration.maps import Calibration, current_from_counts, normalised_torque
+from dexsim.calibration.maps import Calibration, normalised_torque
 from dexsim.core.config import Config, setting
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
@@ -111,9 +111,7 @@ class HandSensing:
             self._torque = lambda counts: counts * scale
         else:
             self._per_count = np.asarray(calibration.force_per_count, np.float32)[:, None]
-            self._torque = jax.jit(
-                lambda counts: normalised_torque(calibration, current_from_counts(calibration, counts))
-            )
+            self._torque = jax.jit(lambda milliamperes: normalised_torque(calibration, milliamperes * np.float32(1e-3)))
 
     @property
     def block(self) -> np.dtype:

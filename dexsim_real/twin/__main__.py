@@ -18,9 +18,8 @@ from dexsim.core import cli
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.process import use_realtime
-from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.server import Twin
+from dexsim_real.twin.server import Twin, TwinArguments
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.twin.wire.firmware import SERIALS
 from dexsim_real.wire.serial_hand import check_wire
@@ -36,7 +35,6 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
         kind=arguments.parameters,
         seconds=arguments.seconds,
         first=arguments.first,
-        shape=None if arguments.shape == "any" else arguments.shape,
         plant_model=arguments.plant_model,
     )
 
@@ -51,8 +49,6 @@ def runner_command(twin: Twin, calibration: Path) -> list[str]:
         words += ["--imu", str(twin.imu.terminal.name)]
     if twin.masks:
         words += ["--camera", f"unix:{twin.masks.path}"]
-        # Between two trials the object is out of sight for up to 20 s, which would end the run.
-        words += ["--safety.stale-object", "60"] if arguments.trials > 1 else []
     return words
 
 
@@ -68,10 +64,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         cli.check_writable(arguments.output)
     hand = load_hand(arguments.hand or None)
     check_wire(hand)
-    with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
-        twin = Twin(arguments, make_plant(arguments, hand), Path(folder), _show)
+    with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as temporary:
+        folder = arguments.folder or Path(temporary)
+        twin = Twin(arguments, make_plant(arguments, hand), folder, _show)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
-        calibration = Path(folder) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
+        calibration = Path(temporary) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
         known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
         save_calibration(calibration, known)
         try:

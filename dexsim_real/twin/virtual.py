@@ -19,7 +19,7 @@ from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
-from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyDecision, TargetRequest
+from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor
@@ -145,19 +145,6 @@ def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
     return sensor
 
 
-class Unlimited(Safety):
-    """Lets every finite target through, to find out what the limits cost."""
-
-    def _lasted(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
-        return ""
-
-    def _reason_to_hold(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
-        return ""
-
-    def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
-        return self._finish(now, Reaction.NONE, "", target if np.isfinite(target).all() else self.commanded)
-
-
 class VirtualRun:
     """One trial of a policy on an emulated hand: the bridge's loops, with the plant's time as their clock.
 
@@ -167,7 +154,6 @@ class VirtualRun:
       calibration: of this hand.
       command: grip command in [0, 1].
       limits: of the bridge's safety; None is its default.
-      safety: whether these limits apply.
 
     Raises:
       HandError: the policy was trained with another mount than the emulated hand's.
@@ -180,8 +166,6 @@ class VirtualRun:
         calibration: Calibration,
         command: float = 0.5,
         limits: SafetyConfig | None = None,
-        *,
-        safety: bool = True,
     ):
         trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task, plant.hand.thumb_side)
         if np.abs(trained - mounted).max() > 0.01:
@@ -190,8 +174,7 @@ class VirtualRun:
                 f"emulated hand has {np.round(mounted, 2).tolist()}; use a policy that was trained with this mount"
             )
         self.plant, self.controller = plant, controller
-        limits = limits_for(limits or SafetyConfig(), controller)
-        self.safety = (Safety if safety else Unlimited)(controller.hand, limits)
+        self.safety = Safety(controller.hand, limits_for(limits or SafetyConfig(), controller))
         self.port = port = VirtualPort(plant)
         sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)

@@ -8,8 +8,8 @@ from press_bench import Plate
 from rich.console import Console
 
 from dexsim_real.calibrate import __main__ as calibrate
+from dexsim_real.calibrate.bench import Operator
 from dexsim_real.calibrate.options import CalibrateArguments, PressConfig
-from dexsim_real.calibrate.person import Operator
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.frames import Mode

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 
 from twin_plant import REST, ScriptedPlant
 
-from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.server import Twin
+from dexsim_real.twin.server import Twin, TwinArguments
 from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.line import HandLine

@@ -2,13 +2,11 @@
 
     AWAY -> (joint targets at the start posture, joints near it) -> HOLD -> (joint targets move) -> FREE -> AWAY
 
-While away the object has its release orientation, so that an IMU in it can be aligned. A runner that continues after a
-drop never returns to the start posture: after `patience` seconds the assistant places the next object as soon as the
-fingers leave its place clear.
+While away the object has its release orientation, so that an IMU in it can be aligned. Each object waits for the hand
+to return to the start posture.
 """
 
 import enum
-from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
@@ -57,7 +55,6 @@ _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start postur
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
 _OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
 _SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the release position
-_HAND_OVER = 0.5  # s of holding before release, for a runner that continues after a drop
 _PLACES = 60  # sampled for an object
 
 
@@ -130,18 +127,13 @@ def find_place(
     scene.set_joints(data, start.posture)
     for _ in range(_PLACES):
         place = sample_place(parameters, shape, rng, face, start)
-        if clear(scene, data, place):
+        put(scene, data, place.position, place.quat)
+        mujoco.mj_kinematics(scene.model, data)
+        mujoco.mj_collision(scene.model, data)
+        touching = scene.is_object[data.contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
+        if np.all(data.contact.dist[touching] > -_OVERLAP):
             return place
     return None
-
-
-def clear(scene: Scene, data: mujoco.MjData, place: Place) -> bool:
-    """Whether the hand in the state `data` leaves the release pose clear. Moves the object there."""
-    put(scene, data, place.position, place.quat)
-    mujoco.mj_kinematics(scene.model, data)
-    mujoco.mj_collision(scene.model, data)
-    touching = scene.is_object[data.contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
-    return bool(np.all(data.contact.dist[touching] > -_OVERLAP))
 
 
 def put(scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: object = 0.0) -> None:
@@ -164,45 +156,34 @@ class Assistant:
 
     Args:
       posture: [J] rad, where trials start.
-      patience: s after which a runner that does not return to the start posture gets its object where it is.
 
     Attributes:
       reaction: s from the first motion of the targets to the release, a person's.
     """
 
-    def __init__(self, posture: np.ndarray, patience: float = 15.0):
-        self._posture, self._patience, self.reaction = np.asarray(posture), patience, 0.0
+    def __init__(self, posture: np.ndarray):
+        self._posture, self.reaction = np.asarray(posture), 0.0
         self.begin()
 
     def begin(self) -> None:
         """Take the object away, and wait for the hand."""
         self.stage = Stage.AWAY
-        self._since: float | None = None  # s, when the motors came on: from then on patience counts
-        self._release: tuple[float, float] | None = None  # s, the object is let go this long after this time
+        self._moved: float | None = None  # s, when the targets left the start posture
 
-    def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, is_clear: Callable[[], bool]) -> Stage:
-        """Update the stage.
-
-        Args:
-          time: s.
-          targets, joints: [12] rad; targets are None when the motors are off.
-          is_clear: tells whether the hand leaves the release pose clear.
-        """
+    def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray) -> Stage:
+        """Update the stage at a time in s by targets and joints [J] rad; targets are None when the motors are off."""
         if self.stage is Stage.FREE:
             return self.stage
         if targets is None:
             self.begin()
             return self.stage
-        self._since = time if self._since is None else self._since
         off = np.max(np.abs(targets - self._posture))
         if self.stage is Stage.AWAY:
             if off < _ARRIVED and np.max(np.abs(joints - self._posture)) < _NEAR:
                 self.stage = Stage.HOLD
-            elif time - self._since > self._patience and is_clear():
-                self.stage, self._release = Stage.HOLD, (time, _HAND_OVER)
             return self.stage
-        if self._release is None and off > _LEFT:
-            self._release = time, self.reaction
-        if self._release is not None and time - self._release[0] >= self._release[1]:
+        if self._moved is None and off > _LEFT:
+            self._moved = time
+        if self._moved is not None and time - self._moved >= self.reaction:
             self.stage = Stage.FREE
         return self.stage

@@ -15,7 +15,7 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, clear, find_place, put, start_of, tilted_gravity
+from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, find_place, put, start_of, tilted_gravity
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.hand_model import own_model, read_model
 from dexsim_real.twin.plant.parameters import (
@@ -27,7 +27,7 @@ from dexsim_real.twin.plant.parameters import (
     sample_trial,
     skill_of,
 )
-from dexsim_real.twin.plant.referee import Referee
+from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
@@ -74,8 +74,8 @@ class EmulatedHand:
       seconds: time limit of a trial; None is that of the task.
       shape: name of the objects (grasp); None samples one per trial.
       first: number of the first trial. A trial does not depend on the trials before it.
-      plant_model: MJCF of a hand, or a TOML that names it (`hand_model.read_model`): its body and contacts take the
-        place of the emulated hand's own.
+      plant_model: MJCF of a hand (`hand_model.read_model`): its body and contacts take the place of the emulated hand's
+        own.
 
     Raises:
       HandError: the plant model does not fit the hand, or decides an overridden parameter itself.
@@ -89,7 +89,7 @@ class EmulatedHand:
         *,
         trials: int | None = None,
         kind: str = "outside",
-        overrides: Mapping[str, float | str] | None = None,
+        overrides: Mapping[str, float] | None = None,
         seconds: float | None = None,
         shape: str | None = None,
         first: int = 0,
@@ -272,7 +272,7 @@ class EmulatedHand:
     def _before(self) -> None:
         """Forces on the object for the next period."""
         if self.stage is Stage.FREE:
-            self._pushes.apply(self.time, self._data.xfrc_applied[self._scene.object_body][:3])
+            self._data.xfrc_applied[self._scene.object_body][:3] = self._pushes.force(self.time)
 
     def _step(self) -> None:
         scene, data = self._scene, self._data
@@ -316,18 +316,19 @@ class EmulatedHand:
         scene, data, dof, at = self._scene, self._data, self._scene.object_dof, self._scene.object_qpos
         quat = data.qpos[at + 3 : at + 7].copy()
         force, normal = tip_forces(self._touches, self.hand.num_fingers)
-        taxels = self._samples[-1][1][..., 2].sum(-1)
-        self._referee.watch(
-            self._look_every * self._period,
-            data.qpos[at : at + 3].copy(),
-            quat,
-            matrix(quat) @ data.qvel[dof + 3 : dof + 6],
-            {"force": np.linalg.norm(force, axis=-1), "normal": normal, "taxels": taxels},
-            self.true_pose()[0],
-            data.qvel[scene.drive_dof],
-            self._drives.at_limit(),
-            self._pushes.acting,
+        look = Look(
+            position=data.qpos[at : at + 3].copy(),
+            quat=quat,
+            spin=float((matrix(quat) @ data.qvel[dof + 3 : dof + 6])[0]),
+            force=np.linalg.norm(force, axis=-1),
+            normal=normal,
+            taxels=self._samples[-1][1][..., 2].sum(-1),
+            joint_position=self.true_pose()[0],
+            joint_speed=data.qvel[scene.drive_dof],
+            limited=bool(self._drives.at_limit().any()),
+            disturbed=bool(self._pushes.last.any()),
         )
+        self._referee.watch(self._look_every * self._period, look)
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
             self._referee.end = "dropped: the physics failed"
         if self._referee.end:
@@ -335,18 +336,12 @@ class EmulatedHand:
             self._next_trial()
 
     def _assist(self) -> None:
-        before, command, targets = self.stage, self._command, None
+        command, targets = self._command, None
         if command is not None and np.all(command["mode"] == Mode.POSITION):
             targets = command["position"].astype(float)
-        stage = self._assistant.watch(self.time, targets, self._joints, self._place_is_clear)
-        if stage is Stage.FREE and before is Stage.HOLD:
+        if self._assistant.watch(self.time, targets, self._joints) is Stage.FREE:
             put(self._scene, self._data, *self._place)
             self._pushes.begin(self.time)
-
-    def _place_is_clear(self) -> bool:
-        probe = mujoco.MjData(self._scene.model)
-        probe.qpos[:] = self._data.qpos
-        return clear(self._scene, probe, self._place)
 
 
 class Pushes:
@@ -354,28 +349,22 @@ class Pushes:
 
     def __init__(self, parameters: TrialParameters, rng: np.random.Generator):
         self._parameters, self._rng = parameters, rng
-        self._until: float | None = None  # s, end of the push that lasts
-        self._at = np.inf  # s, of the next push
-
-    @property
-    def acting(self) -> bool:
-        """Whether a push acts now."""
-        return self._until is not None
+        self.last = np.zeros(3)  # N, of the last period
+        self._until = self._at = np.inf  # s, end of the push that acts; beginning of the next
 
     def begin(self, time: float) -> None:
         """The object is free from a time in s."""
         rate = PUSHES[skill_of(self._parameters.task)][0] * self._parameters.push_rate
         self._at = time + self._rng.exponential(1 / rate) if rate > 0 else np.inf
 
-    def apply(self, time: float, force: np.ndarray) -> None:
-        """Set the force [3] N on the object at a time in s."""
-        if self._until is not None and time >= self._until:
-            force[:], self._until = 0.0, None
-        if time < self._at:
-            return
-        parameters, duration = self._parameters, self._parameters.push_seconds
-        direction = self._rng.standard_normal(3)
-        change = PUSHES[skill_of(parameters.task)][1] * self._rng.random() * direction / np.linalg.norm(direction)
-        force[:] = parameters.mass * change / duration
-        self._until = time + duration
-        self.begin(time)
+    def force(self, time: float) -> np.ndarray:
+        """The force [3] N on the object at a time in s."""
+        if time >= self._until:
+            self.last, self._until = np.zeros(3), np.inf
+        if time >= self._at:
+            parameters, direction = self._parameters, self._rng.standard_normal(3)
+            change = PUSHES[skill_of(parameters.task)][1] * self._rng.random() * direction / np.linalg.norm(direction)
+            self.last = parameters.mass * change / parameters.push_seconds
+            self._until = time + parameters.push_seconds
+            self.begin(time)
+        return self.last

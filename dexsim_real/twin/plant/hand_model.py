@@ -1,19 +1,11 @@
 """The body of the emulated hand: links, inertias and geoms from an MJCF, in the palm frame.
 
 The hand's own MJCF (`own_model`), or one by somebody else (`read_model`), which need not have its names: joints are
-found by name, or by the order of the actuators; the palm is the body that carries all of them; a fingertip is the site
-on the body that the finger's last joint moves. A TOML says what cannot be found:
-
-    model = "my_hand.xml"
-    palm = "base"                  # body or site: fingers along z, palm normal x, thumb side y
-    joints = ["j0", ..., "j11"]    # in the order of the hand
-    tips = ["tip_0", ..., "tip_4"] # sites at the tips, in the order of the fingers
-
-The motors are the emulated hand's in both cases.
+found by name, or by the order of the actuators; the palm is the site "palm", or the body that carries all of them; a
+fingertip is the site on the body that the finger's last joint moves. The motors are the emulated hand's in both cases.
 """
 
 import dataclasses
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -46,16 +38,6 @@ class HandModel:
     foreign: bool = False  # contacts, friction, time step and solver are those of the file
 
 
-@dataclasses.dataclass(frozen=True)
-class _Names:
-    """What a TOML may say."""
-
-    model: str
-    palm: str = ""
-    joints: tuple[str, ...] = ()
-    tips: tuple[str, ...] = ()
-
-
 def own_model(hand: Hand) -> HandModel:
     """The hand's own MJCF; its collisions, options and motors are left out.
 
@@ -79,7 +61,7 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     """Read and check an MJCF by somebody else.
 
     Args:
-      path: the MJCF, or a TOML that names it and its parts.
+      path: the MJCF.
       hand: whose joints, fingertips and taxels it must have.
 
     Raises:
@@ -87,18 +69,17 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     """
     path = Path(path)
     try:
-        names = _Names(**tomllib.loads(path.read_text())) if path.suffix == ".toml" else _Names(path.name)
-        spec = mujoco.MjSpec.from_file(str(path.parent / names.model))
+        spec = mujoco.MjSpec.from_file(str(path))
         _let_touch(spec)
         _leave_out_scenery(spec)
         model = spec.compile()
-        joints = _find_joints(model, hand, names.joints)
+        joints = _find_joints(model, hand)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        palm = _find_palm(data, joints, names.palm)
-        tips = [_find_tip(model, hand, joints, finger, names.tips) for finger in range(hand.num_fingers)]
+        palm = _find_palm(data, joints)
+        tips = [_find_tip(model, hand, joints, finger) for finger in range(hand.num_fingers)]
         _check_places(model, hand, joints, palm, tips)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError) as error:
         raise HandError(f"{path}: {' '.join(str(error).split())[:300]}") from None
     lattices = _add_lattices(spec, data, hand, palm, tips)
     _delete(spec, *spec.actuators)
@@ -149,11 +130,11 @@ def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
     _delete(spec, *spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples, *pairs, *floors, *loose)
 
 
-def _find_joints(model: mujoco.MjModel, hand: Hand, given: tuple[str, ...]) -> list[int]:
-    """The named joints, those with the hand's names, or those with an actuator; in the order of the hand."""
+def _find_joints(model: mujoco.MjModel, hand: Hand) -> list[int]:
+    """The joints with the hand's names, or those with an actuator; in the order of the hand."""
     hinges = {model.joint(j).name: j for j in range(model.njnt) if model.jnt_type[j] == _HINGE}
     driven = [model.joint(int(joint)).name for joint in model.actuator_trnid[:, 0]]
-    names = given or (hand.joint_names if set(hand.joint_names) <= hinges.keys() else tuple(driven))
+    names = hand.joint_names if set(hand.joint_names) <= hinges.keys() else driven
     if len(set(names)) != hand.num_joints or set(names) - hinges.keys():
         raise ValueError(f"{len(set(names))} joints, the hand has {hand.num_joints}; hinges are {', '.join(hinges)}")
     for name, end, low, high in zip(names, hand.joint_names, hand.joint_lower, hand.joint_upper, strict=True):
@@ -167,15 +148,13 @@ def _find_joints(model: mujoco.MjModel, hand: Hand, given: tuple[str, ...]) -> l
     return [hinges[name] for name in names]
 
 
-def _find_palm(data: mujoco.MjData, joints: list[int], given: str) -> Pose:
-    """The palm frame in the world: that of a body or site, or of the body that carries all joints."""
+def _find_palm(data: mujoco.MjData, joints: list[int]) -> Pose:
+    """The palm frame in the world: that of the site "palm", or of the body that carries all joints."""
     model = data.model
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, given)
-    body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, given)
-    if not given:  # The deepest that carries all: a body comes after its parent.
-        body = max(set.intersection(*(_carriers(model, int(model.jnt_bodyid[joint])) for joint in joints)))
-    if body < 0:
-        raise ValueError(f"palm: there is neither a body nor a site {given!r}")
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "palm")
+    # The deepest that carries all: a body comes after its parent.
+    carriers = (_carriers(model, int(model.jnt_bodyid[joint])) for joint in joints)
+    body = model.site_bodyid[site] if site >= 0 else max(set.intersection(*carriers))
     if model.body_weldid[body] != 0:
         raise ValueError(f"the palm ({model.body(body).name}) moves: fix it to the world")
     frame = data.site(site) if site >= 0 else data.body(body)
@@ -188,15 +167,13 @@ def _carriers(model: mujoco.MjModel, body: int) -> set[int]:
     return {parent} | (_carriers(model, parent) if parent else set())
 
 
-def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, given: tuple[str, ...]) -> int:
-    """The site at the tip of a finger: the named one, the only one, or the one with "tip" in its name."""
+def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int) -> int:
+    """The site at the tip of a finger: the only one on its last link, or the one with "tip" in its name."""
     last = next(body for body in finger_bodies(hand, finger) if hand.body_joint[body] >= 0)
     joint = joints[int(hand.body_joint[last])]
     moved = model.body_weldid[model.jnt_bodyid[joint]]
     sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == moved]
-    if given:
-        sites = [site for site in sites if model.site(site).name in given]
-    elif len(sites) > 1:
+    if len(sites) > 1:
         sites = [site for site in sites if "tip" in model.site(site).name.lower()]
     if len(sites) != 1:
         raise ValueError(

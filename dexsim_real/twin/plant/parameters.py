@@ -188,31 +188,24 @@ def sample_trial(
     task: str,
     rng: np.random.Generator,
     kind: str = "outside",
-    overrides: Mapping[str, float | str] | None = None,
+    overrides: Mapping[str, float] | None = None,
     hand: Hand | None = None,
 ) -> TrialParameters:
     """Sample the parameters of a trial.
 
     Args:
       hand: gives the number of joints and fingers; None is the XHand.
-      overrides: by name a value, the same for all joints, fingers or axes; or one of `KINDS` for this parameter alone.
+      overrides: by name a value, the same for all joints, fingers or axes.
 
     Raises:
-      HandError: there is no such parameter or kind.
+      HandError: there is no such parameter.
     """
     table, given = bands(task), overrides or {}
-    kinds = {name: number for name, number in given.items() if isinstance(number, str)}
-    for name, number in given.items():
-        known = table if name in kinds else table | STRUCTURE
-        if name not in known:
-            what = "sample" if name in kinds else "set"
-            raise HandError(
-                f"the emulated hand has no parameter {name!r} to {what}; choose from {', '.join(sorted(known))}"
-            )
-        if name in kinds and number not in KINDS:
-            raise HandError(f"{name} = {number!r}: give a number, or one of {', '.join(KINDS)}")
+    if unknown := sorted(given.keys() - table.keys() - STRUCTURE.keys()):
+        known = ", ".join(sorted(table | STRUCTURE))
+        raise HandError(f"the emulated hand has no parameter {unknown[0]!r}; choose from {known}")
     count = _COUNT | ({"joint": (hand.num_joints,), "finger": (hand.num_fingers,)} if hand else {})
-    value = {name: table[name].sample(rng, kinds.get(name, kind), count) for name in sorted(table)}
+    value = {name: table[name].sample(rng, kind, count) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
-    value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
+    value |= {name: np.full_like(value[name], number) for name, number in given.items()}
     return TrialParameters(task, value)

@@ -39,15 +39,28 @@ _TRAPPED = 0.35  # rad, tilt of a cube in a trap
 _AXIS = np.array([1.0, 0.0, 0.0])
 
 
+class Look(NamedTuple):
+    """The true state at one time, palm frame; J joints, F fingers."""
+
+    position: np.ndarray  # [3] m of the object
+    quat: np.ndarray  # [4]
+    spin: float  # rad/s about the palm's normal
+    force: np.ndarray  # [F] N on the fingertips
+    normal: np.ndarray  # [F] N, its part along the contact's normal
+    taxels: np.ndarray  # [F] N on the taxels
+    joint_position: np.ndarray  # [J] rad
+    joint_speed: np.ndarray  # [J] rad/s
+    limited: bool  # a joint is at its torque limit
+    disturbed: bool  # a push acts on the object
+
+
 class _Moment(NamedTuple):
-    """What may tell the cause of a loss, at one time."""
+    """What may tell the cause of a loss."""
 
     time: float  # s
     touching: int  # fingertips
     tilt: float  # rad
-    limited: bool  # a joint is at its torque limit
-    disturbed: bool  # a push acts
-    pose: dict[str, np.ndarray]  # joint angles, object and forces, for a picture
+    look: Look
 
 
 class Referee:
@@ -77,77 +90,53 @@ class Referee:
         self._step = thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
-        self._force, self._duty, self._speed = np.zeros(fingers), np.zeros(fingers), 0.0
+        self._force, self._speed = np.zeros(fingers), 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
         self._heading: float | None = None  # rad, at the release
         self._moments: collections.deque[_Moment] = collections.deque()
         self._gripped = False  # whether two fingertips ever touched at once
 
-    def watch(
-        self,
-        step: float,
-        position: np.ndarray,
-        quat: np.ndarray,
-        spin: np.ndarray,
-        forces: dict[str, np.ndarray],
-        joint_position: np.ndarray,
-        joint_speed: np.ndarray,
-        at_limit: np.ndarray,
-        disturbed: bool,
-    ) -> None:
-        """Update with the current state.
-
-        Args:
-          step: s since the last update.
-          position, quat, spin: [3] m, [4], [3] rad/s of the object, palm frame.
-          forces: [5] N on the fingertips: "force" whole, "normal" along the contact's normal, "taxels" on the taxels.
-          joint_position, joint_speed: [12] rad, [12] rad/s.
-          at_limit: [12] bool, joints at their torque limit.
-          disturbed: whether a push acts on the object.
-        """
+    def watch(self, step: float, look: Look) -> None:
+        """Update with the current state, `step` s after the last update."""
         if self.end:
             return
         self.time += step
-        touching = forces["force"] > TOUCH
-        self._speed += step * float(np.mean(np.abs(joint_speed)))
-        self._duty += step * touching
-        if touching.any():
+        touching = int(np.sum(look.force > TOUCH))
+        self._speed += step * float(np.mean(np.abs(look.joint_speed)))
+        if touching:
             self._touched = self.time
-        away = float(np.linalg.norm(position - self._reference))
-        tilt = math.acos(float(np.clip(matrix(quat)[:, 0] @ _AXIS, -1.0, 1.0)))
-        rotate = self.task == "rotate"
-        pose = {"joint_position": joint_position, "object_position": position, "object_quat": quat}
-        pose["finger_force"] = forces["force"]
-        self._gripped |= int(touching.sum()) >= 2
-        self._moments.append(_Moment(self.time, int(touching.sum()), tilt, bool(at_limit.any()), disturbed, pose))
+        away = float(np.linalg.norm(look.position - self._reference))
+        tilt = math.acos(float(np.clip(matrix(look.quat)[:, 0] @ _AXIS, -1.0, 1.0)))
+        self._gripped |= touching >= 2
+        self._moments.append(_Moment(self.time, touching, tilt, look))
         while self._moments[0].time < self.time - _TRAP:
             self._moments.popleft()
-        if away > LOST[self.task] or (rotate and tilt > TIPPED):
+        if away > LOST[self.task] or (self.task == "rotate" and tilt > TIPPED):
             self.end = f"dropped: {self._cause(away)}"
             return
-        if rotate:
-            self._count_goals(quat, away, float(spin @ _AXIS))
+        if self.task == "rotate":
+            self._count_goals(look, away)
         elif self.time > self.window[0]:
             # The command applies to the four fingers; the thumb balances them.
-            holding = forces["force"][1:] > _GRIP
+            holding = look.force[1:] > _GRIP
             if holding.any():
-                for name, force in forces.items():
-                    self._finger[name] += float(force[1:][holding].mean())
-            self._force += forces["force"]
+                for name in self._finger:
+                    self._finger[name] += float(getattr(look, name)[1:][holding].mean())
+            self._force += look.force
             self._counted += 1
-            self._limited += bool(np.any(at_limit))
+            self._limited += look.limited
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
 
     def _cause(self, away: float) -> str:
         """Why the object is lost, which now is `away` m from its place; see the head of this module."""
         last = [moment for moment in self._moments if moment.time >= self.time - _LEAD]
-        touched = [moment.limited for moment in last if moment.touching]
+        touched = [moment.look.limited for moment in last if moment.touching]
         trapped = [moment.tilt > _TRAPPED and moment.touching <= 1 for moment in self._moments]
         if not self._gripped:
             return "untouched"
-        if any(moment.disturbed for moment in last):
+        if any(moment.look.disturbed for moment in last):
             return "disturbed"
         if self.task == "rotate" and self.time > _TRAP and np.mean(trapped) > 0.7:
             return "trapped"
@@ -157,14 +146,14 @@ class Referee:
             return "tipped"
         return "pushed out" if self.time - self._touched <= _RECENT else "slipped"
 
-    def _count_goals(self, quat: np.ndarray, away: float, spin: float) -> None:
+    def _count_goals(self, look: Look, away: float) -> None:
         """Goals are 90 degrees apart about the palm's normal, from the first heading on."""
         if self._heading is None:  # Angle of the rotation about x nearest to the orientation.
-            self._heading = 2 * math.atan2(quat[1], quat[0])
+            self._heading = 2 * math.atan2(look.quat[1], look.quat[0])
         for name, fastest in _FASTEST.items():
             goal = turn(_AXIS, self._heading + (self.goals[name] + 1) * self._step)
-            apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
-            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= fastest
+            apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], look.quat)[0]))))
+            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(look.spin) <= fastest
 
     def report(self) -> dict[str, Any]:
         """Metrics so far; JSON-able.
@@ -178,12 +167,17 @@ class Referee:
         report: dict[str, Any] = {
             "seconds": round(self.time, 4),
             "end": self.end or "running",
-            "duty": np.round(self._duty / lived, 4).tolist(),
             "joint_speed": round(self._speed / lived, 4),
         }
         if self.end.startswith("dropped") and self._moments:
-            before = next(moment for moment in self._moments if moment.time >= self.time - _LEAD)
-            report["before"] = {name: np.round(value, 4).tolist() for name, value in before.pose.items()}
+            before = next(moment.look for moment in self._moments if moment.time >= self.time - _LEAD)
+            poses = {
+                "joint_position": before.joint_position,
+                "object_position": before.position,
+                "object_quat": before.quat,
+                "finger_force": before.force,
+            }
+            report["before"] = {name: np.round(value, 4).tolist() for name, value in poses.items()}
         if self.task == "grasp":
             return report | {
                 "held": self.end == "time limit",

@@ -21,7 +21,6 @@ from dexsim_real.twin.wire.line import Terminal
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 PICTURE = (640, 480)  # px, columns and rows
 _LOST = 0.01  # probability that the object is not found in a picture
-_MAX_QUEUED = 4  # masks waiting for a slow reader
 _MOUNT = np.array(UPRIGHT_X)
 
 
@@ -104,7 +103,7 @@ class EmulatedImu:
 
 
 class EmulatedCamera:
-    """The emulated camera, and the program that sends its masks to the clients of a socket; called as `EmulatedImu`.
+    """The emulated camera, and the program that sends its masks to the client of a socket; called as `EmulatedImu`.
 
     Raises:
       HandError: the socket cannot be created.
@@ -113,7 +112,8 @@ class EmulatedCamera:
     def __init__(self, path: Path, plant: EmulatedHand, *, seed: int, start: float):
         self.path, self.due, self.sent = path, start, 0
         self._plant, self._rng = plant, np.random.default_rng(seed)
-        self._clients: dict[socket.socket, bytearray] = {}
+        self._client: socket.socket | None = None
+        self._waiting = b""  # what the client has not read yet
         self._server = socket.socket(socket.AF_UNIX)
         try:
             self._server.bind(str(path))
@@ -121,14 +121,15 @@ class EmulatedCamera:
             self._server.close()
             raise HandError(
                 f"{path}: the socket for masks cannot be created ({error.strerror or error}); remove the file, or "
-                "choose another --mask-socket"
+                "choose another --folder"
             ) from None
         self._server.listen()
         self._server.setblocking(False)
 
     def close(self) -> None:
-        for link in (*self._clients, self._server):
-            link.close()
+        for link in (self._client, self._server):
+            if link:
+                link.close()
         self.path.unlink(missing_ok=True)
 
     def serve(self, now: float) -> None:
@@ -137,23 +138,20 @@ class EmulatedCamera:
             return
         self.due = max(self.due + 1 / CAMERA_RATE, now)
         with contextlib.suppress(BlockingIOError):
-            client, _ = self._server.accept()
-            client.setblocking(False)
-            self._clients[client] = bytearray()
-        if not self._clients:
+            self._client, self._waiting = self._server.accept()[0], b""
+            self._client.setblocking(False)
+        if self._client is None:
             return
-        mask = picture(self._plant, CameraConfig())
-        if self._rng.random() < _LOST:
-            mask[:] = False
-        self.sent += 1
-        data = encode_mask(now, mask)
-        for client, waiting in list(self._clients.items()):
-            if len(waiting) < _MAX_QUEUED * len(data):
-                waiting += data
-            try:
-                del waiting[: client.send(waiting)]
-            except BlockingIOError:
-                pass
-            except OSError:  # The client has disconnected.
-                client.close()
-                del self._clients[client]
+        if not self._waiting:
+            mask = picture(self._plant, CameraConfig())
+            if self._rng.random() < _LOST:
+                mask[:] = False
+            self.sent += 1
+            self._waiting = encode_mask(now, mask)
+        try:
+            self._waiting = self._waiting[self._client.send(self._waiting) :]
+        except BlockingIOError:
+            pass
+        except OSError:  # The client has disconnected.
+            self._client.close()
+            self._client = None

@@ -3,9 +3,9 @@
 An exchange has at most one fault, so the injected faults determine what the host must count (docs/emulated_hand.md).
 """
 
-import dataclasses
 from collections import Counter
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +18,11 @@ ALL = -1  # all joints
 BOARDS = ("palm", "joint", "tip")
 PARTS = (*map(str, range(frames.JOINTS)), *(f"tip{tip}" for tip in range(frames.TIPS)), "palm")
 _RUN = 40  # bytes, longest run that is dropped or duplicated
-_SIDE: dict[str, tuple | range] = {"side": ("answer", "request")}
-_JOINT: dict[str, tuple | range] = {"joint": range(frames.JOINTS)}
+Span = tuple | range
+_SIDE: dict[str, Span] = {"side": ("answer", "request")}
+_JOINT: dict[str, Span] = {"joint": range(frames.JOINTS)}
 
-KINDS: dict[str, dict[str, tuple | range]] = {
+KINDS: dict[str, dict[str, Span]] = {
     "flip": _SIDE,
     "drop": _SIDE,
     "duplicate": _SIDE,
@@ -40,22 +41,11 @@ KINDS: dict[str, dict[str, tuple | range]] = {
 where to where a number is drawn that the line leaves out. Without seconds a fault lasts to the end."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Fault:
-    """The fault of an exchange, of a kind in `KINDS`. Each of its values is also an attribute."""
-
-    kind: str
-    values: dict[str, Any]
-
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return self.__dict__["values"][name]
-        except KeyError:
-            raise AttributeError(name) from None
+class Fault(SimpleNamespace):
+    """The fault of an exchange: its `kind`, and its values by the names in `KINDS`."""
 
     def __str__(self) -> str:
-        values = (f"{value:g}" if name == "seconds" else str(value) for name, value in self.values.items())
-        return " ".join((self.kind, *values))
+        return " ".join(f"{value:g}" if name == "seconds" else str(value) for name, value in vars(self).items())
 
 
 class FaultLine(NamedTuple):
@@ -65,10 +55,6 @@ class FaultLine(NamedTuple):
     given: dict[str, Any]
     time: float  # s after the first exchange; infinite for a random fault
     probability: float  # per exchange; 0 for a fault at a time
-
-    def fault(self, rng: np.random.Generator) -> Fault:
-        """The fault, with values that the line leaves out sampled."""
-        return Fault(self.kind, {name: _draw(span, rng) for name, span in KINDS[self.kind].items()} | self.given)
 
 
 def parse_fault(line: str) -> FaultLine:
@@ -93,20 +79,17 @@ def parse_fault(line: str) -> FaultLine:
     return FaultLine(kind, given, np.inf, number / 100) if share else FaultLine(kind, given, number, 0.0)
 
 
-def _parse(span: tuple | range, word: str) -> Any:
-    if isinstance(span, range):
-        return span[span.index(int(word))]
-    if isinstance(span[0], str):
-        return span[span.index(word)]
-    if not np.isfinite(number := float(word)):
-        raise ValueError
-    return number
+def _parse(span: Span, word: str) -> Any:
+    """A value of a line: one of the words or whole numbers of its span, or any finite number."""
+    if isinstance(span[0], float):
+        if not np.isfinite(number := float(word)):
+            raise ValueError
+        return number
+    return span[span.index(type(span[0])(word))]
 
 
-def _draw(span: tuple | range, rng: np.random.Generator) -> Any:
-    if isinstance(span, range) or isinstance(span[0], str):
-        return span[int(rng.integers(len(span)))]
-    return float(rng.uniform(*span))
+def _draw(span: Span, rng: np.random.Generator) -> Any:
+    return float(rng.uniform(*span)) if isinstance(span[0], float) else span[int(rng.integers(len(span)))]
 
 
 class Injector:
@@ -132,7 +115,7 @@ class Injector:
             raise HandError("faults: the percentages must not exceed 100 in sum")
 
     def sample(self, now: float) -> Fault | None:
-        """The fault of the exchange requested at `now` s; None for none. It is counted as injected."""
+        """The fault of the exchange requested at `now` s, what its line leaves out drawn; None for none."""
         self._first = now if self._first is None else self._first
         line = None
         if self._script and now - self._first >= self._script[0].time:
@@ -142,9 +125,9 @@ class Injector:
             line = self._random[at] if at < len(self._random) else None
         if line is None:
             return None
-        fault = line.fault(self._rng)
-        self.injected[f"{fault.kind} {fault.side}" if fault.kind in BYTES else fault.kind] += 1
-        return fault
+        values = {name: _draw(span, self._rng) for name, span in KINDS[line.kind].items()} | line.given
+        self.injected[f"{line.kind} {values['side']}" if line.kind in BYTES else line.kind] += 1
+        return Fault(kind=line.kind, **values)
 
     def damage(self, kind: str, frame: bytes) -> bytes:
         """The damaged bytes of a frame [bytes]; they never contain the intact frame."""

@@ -57,9 +57,9 @@ class Firmware:
 
     def begin(self, fault: Fault, now: float) -> None:
         """Begin a fault of the board at a time in s; it ends by itself."""
-        if fault.kind == "jam":  # Where the joint is now.
-            fault = Fault("jam", fault.values | {"radians": float(self.angles[fault.joint])})
-        self.faults.append((now + fault.values.get("seconds", np.inf), fault))
+        if fault.kind == "jam":
+            fault.radians = float(self.angles[fault.joint])  # where the joint is now
+        self.faults.append((now + getattr(fault, "seconds", np.inf), fault))
 
     def answer(self, frame: Frame, now: float) -> Frame | None:
         """Execute a frame and return the answer; None for a frame addressed to another hand."""

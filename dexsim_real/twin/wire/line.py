@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.timing import Timing
 from dexsim_real.twin.wire.faults import BYTES, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.wire import frames
@@ -117,7 +116,6 @@ class HandLine:
     ):
         self.terminal, self.firmware, self.injector = terminal, firmware, injector
         self.counts: Counter[str] = Counter()
-        self.lateness = Timing()  # of the chunks of answers
         self._catch_up, self._note = catch_up, note
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
         self._request: tuple[float, Frame] | None = None  # when the board has received and processed it (s)
@@ -144,9 +142,7 @@ class HandLine:
             (due, frame), self._request = self._request, None
             self._act(now, due, frame)
         while self._answer and self._answer[0][0] <= now:
-            due, chunk = self._answer.popleft()
-            self.lateness.add(now - due)
-            self.terminal.write(chunk)
+            self.terminal.write(self._answer.popleft()[1])
 
     def _listen(self, now: float) -> None:
         data = self.terminal.read()

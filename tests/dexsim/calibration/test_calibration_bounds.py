@@ -71,7 +71,6 @@ WRONG = [
     ({"real.force_max": 1000.0}, "thumb_bend: real.force_max = 1000: .* 100 N"),
     ({"real.value_max": 100.0}, "thumb_bend: real.value_max = 100: .* 33 A"),
     ({"force_per_count": 1e-9}, "thumb: force_per_count = 1e-09: must be between 0.001 and 1 N"),
-    ({"current_per_count": 0.05}, "current_per_count = 0.05: .* 0.001"),
     ({"force_per_torque": 0.5}, "thumb: force_per_torque = 0.5: .* N/Nm"),
     # Each line goes with the simulation's of its own direction, but not with the middle of both, which is used.
     (
@@ -98,7 +97,7 @@ DAMAGED = [
     ("[-0.05,", '["a",', "damaged"),
     ("force_per_count = [", "force_per_count = [0.1, ", "'force_per_count' must hold 5 numbers"),
     ("friction = ", "fiction = ", "unknown entry 'fiction'"),
-    ("version = 2", "version = 1", "it has version 1, this library reads 2"),
+    ("version = 3", "version = 1", "it has version 1, this library reads 3"),
     ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
     ('"thumb_bend"', '"thumb_bent"', "calibrate this hand"),
     ("xhand_right", "x" * 5000, "is of hand 'x+"),
@@ -129,7 +128,7 @@ def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
 NUMBERS = st.one_of(st.floats(), st.floats(-3, 3), st.sampled_from([0.0, 1e-9, 1e9]))
 PAIRS = st.one_of(NUMBERS, st.lists(NUMBERS, min_size=2, max_size=2))
 LINES = st.sampled_from(["real.gain", "real.offset", "sim.gain", "sim.offset"])
-SINGLES = st.sampled_from(["torque_scale", "force_per_count", "current_per_count"])
+SINGLES = st.sampled_from(["torque_scale", "force_per_count"])
 
 
 @settings(max_examples=150)

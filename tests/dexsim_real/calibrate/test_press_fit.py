@@ -12,16 +12,17 @@ from dexsim.calibration.maps import calibrated_hand, joint_torque, load_calibrat
 from dexsim.core.errors import CalibrationError
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
-from dexsim_real.calibrate.force_scale import dead_taxels, fill_dead, force_scale
+from dexsim_real.calibrate.bench import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.person import Operator
-from dexsim_real.calibrate.press_fit import fit, torque_constant_intervals, torque_constants
-from dexsim_real.calibrate.read import Recording, Source, read_presses
+from dexsim_real.calibrate.press_fit import (
+    dead_taxels,
+    fill_dead,
+    fit,
+    torque_constant_intervals,
+    torque_constants,
+)
+from dexsim_real.calibrate.read import read_presses
 from dexsim_real.core.log import Kind, LogReader, LogWriter
-from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.wire.identity import Identity
-
-GAIN, ZERO = 8.0, 20.0  # counts per newton, counts at zero force
 
 
 def truth_of(bench):
@@ -161,14 +162,13 @@ def test_a_kitchen_scale_gives_the_newtons(hand, scale):
     assert "thumb: not compared with the gauge" in notes and "error of the force sensor" not in notes
 
 
-@pytest.mark.parametrize("readings", [0, 7])
-def test_without_enough_readings_the_scales_error_is_in_the_intervals(hand, scale, readings):
+def test_without_enough_readings_the_scales_error_is_in_the_intervals(hand, scale):
     """The taxels read 15 % too little, and nothing in the presses shows it."""
     bench, options, _ = scale
     source, recordings = read_presses([options.log], hand)
     truth = truth_of(bench)[:, 6:8]
     recording = recordings["middle pad"]
-    recording.gauge = dict(list(recording.gauge.items())[:readings])
+    recording.gauge = dict(list(recording.gauge.items())[:7])
     calibration = fit(source, recordings, hand).calibration
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     low, high = np.sort(intervals[:, 6:8], -1).transpose(2, 0, 1)
@@ -192,33 +192,6 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     recording.shear = list(np.outer(sums, [0.0, 20.0]))
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
         fit(*session, hand)
-
-
-# --- the scale -------------------------------------------------------------------------------
-
-
-def pressed(forces, hand, dead=()):
-    """The scale of a press of the index finger whose middle taxels read GAIN F + ZERO."""
-    press = Recording(name="index pad", finger=1, joints=(4,), rate=83.0)
-    for level, force in enumerate(forces):
-        for sample in range(5):
-            counts = np.zeros(hand.num_taxels)
-            counts[[41, 42, 43, 53, 54, 55, 65, 66, 67]] = (GAIN * force + ZERO) / 9
-            counts[list(dead)] = 0.0
-            press.phase.append(f"level {level}")
-            press.time.append(level + 0.1 * sample)
-            press.counts.append(counts)
-            press.position.append(np.zeros(12))
-        press.gauge[f"level {level}"] = float(force)
-    source = Source(HardwareConfig(), 83.0, Identity())
-    return force_scale(source, hand, [press]).newtons["index pad"]
-
-
-def test_a_zero_error_is_taken_from_the_force_and_dead_taxels_are_filled_in(hand):
-    gain, offset = pressed(np.linspace(0.5, 8.0, 12), hand)
-    for force in (1.0, 5.0):
-        assert gain * (GAIN * force + ZERO) + offset == pytest.approx(force, rel=0.01)
-    assert pressed(np.linspace(0.5, 8.0, 12), hand, dead=[54])[0] == pytest.approx(gain, rel=0.01)
 
 
 def test_dead_taxels_are_those_among_pressed_ones(hand):

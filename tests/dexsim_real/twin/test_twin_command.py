@@ -71,31 +71,30 @@ def test_the_command_ends_after_its_trials_and_writes_its_results(tmp_path):
     assert f"python -m dexsim_real.run grasp --port {folder}/dexsim-twin-" in shown
     assert f"--camera unix:{folder}/dexsim-twin-" in shown
     report = json.loads((tmp_path / "out.json").read_text())
-    assert [row["trial"] for row in report["trials"]] == [0, 1] and report["exchanges"] == {}
+    assert [row["trial"] for row in report["trials"]] == [0, 1] and report["line"] == {}
     assert not os.path.lexists(shown.split("--port ")[1].split()[0])
 
 
 def test_it_offers_a_calibration_of_this_hand_and_ends_in_good_order_when_it_is_told_to(hand, tmp_path):
-    waiting = start("--link", str(tmp_path / "port"), "--output", str(tmp_path / "out.json"))
+    waiting = start("--folder", str(tmp_path), "--output", str(tmp_path / "out.json"))
     assert waiting.stdout.readline().startswith(b"rotate: the emulated hand is at")
     shown = waiting.stdout.readline().decode()
     calibration = load_calibration(shown.split("--calibration ")[1].split()[0], hand)
     np.testing.assert_allclose(calibration.force_per_count, FORCE_PER_COUNT)
     assert (calibration.serial, calibration.handedness) == (SERIALS["right"], "right")
     waiting.send_signal(signal.SIGTERM)
-    assert waiting.wait(10) == 0 and (tmp_path / "out.json").exists() and not (tmp_path / "port").is_symlink()
+    assert waiting.wait(10) == 0 and (tmp_path / "out.json").exists() and not (tmp_path / "hand").is_symlink()
     waiting.communicate()
 
 
 def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
-    (tmp_path / "there").touch()
+    (tmp_path / "masks").touch()
     for options, says in (
         ("--faults 5,melt", "give a time in s or a percentage"),
         ("--task juggle", "choose from grasp, rotate"),
-        (f"--link {tmp_path}/no/port", "no pseudo-terminal"),
-        (f"--task grasp --mask-socket {tmp_path}/no/m", "socket for masks cannot be created"),
-        (f"--task grasp --mask-socket {tmp_path}/there", "remove the file"),
+        (f"--folder {tmp_path}/no", "no pseudo-terminal"),
+        (f"--task grasp --folder {tmp_path}", "socket for masks cannot be created .* remove the file"),
     ):
         words = [word.replace(",", " ") for word in options.split()]
         with pytest.raises(DexsimError, match=says) as error:

@@ -10,7 +10,7 @@ import pytest
 from emulated_plant import free
 from paths import ROOT
 
-from dexsim.calibration.maps import current_from_counts, normalised_torque
+from dexsim.calibration.maps import normalised_torque
 from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
@@ -45,10 +45,10 @@ class Scripted:
         return Tick(None, None, None, target)
 
 
-def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, safety=True, **overrides):
+def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
     plant = EmulatedHand(hand, task, 4, kind="nominal", trials=1, seconds=seconds, overrides=CALM | overrides)
     controller = Scripted(hand, task, script, sources)
-    return VirtualRun(plant, controller, ideal_calibration(hand), 0.25, safety=safety), plant, controller
+    return VirtualRun(plant, controller, ideal_calibration(hand), 0.25), plant, controller
 
 
 def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
@@ -80,15 +80,10 @@ def test_measurements_are_as_old_as_the_exchange_makes_them(hand):
     assert np.diff(times)[40:] == pytest.approx(np.full(len(times) - 41, 1 / RATE), abs=1e-9)  # after the tare
 
 
-def test_an_unsafe_wish_is_clipped_unless_the_limits_are_left_out(hand):
-    def jump(k, target):
-        return target + 0.8 * (np.arange(12) == 4)
-
-    for safety in (True, False):
-        run, _, _ = virtual(hand, "rotate", jump, seconds=0.15, safety=safety)
-        run.run()
-        clipped = [name for name in run.safety.counts if name.startswith("target beyond a limit")]
-        assert bool(clipped) == safety
+def test_an_unsafe_wish_is_clipped(hand):
+    run, _, _ = virtual(hand, "rotate", lambda k, target: target + 0.8 * (np.arange(12) == 4), seconds=0.15)
+    run.run()
+    assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
 
 
 def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
@@ -120,10 +115,8 @@ def test_the_camera_measures_the_height(hand):
 
 def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
     calibration = ideal_calibration(hand)
-    counts = -1000.0 * 0.5 * np.ones(12)  # mA, closing, half of what stalls
-    assert np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts))) == pytest.approx(
-        np.full(12, 0.5), abs=1e-6
-    )
+    current = -0.5 * np.ones(12, np.float32)  # A, closing, half of what stalls
+    assert np.asarray(normalised_torque(calibration, current)) == pytest.approx(np.full(12, 0.5), abs=1e-6)
     assert HardwareConfig().current_sign < 0
 
 

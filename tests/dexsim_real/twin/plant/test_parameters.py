@@ -129,11 +129,6 @@ def test_inside_nominal_and_overrides():
     fixed = sample_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
     assert np.all(fixed.gear_play == 0.002) and fixed.rolling == 0.0
     assert np.array_equal(fixed.stiffness, sample_trial("grasp", np.random.default_rng(3)).stiffness)
-    # One parameter outside, all others nominal: the very value that it has with all others outside.
-    one = sample_trial("grasp", np.random.default_rng(3), "nominal", {"friction": "outside"})
-    assert one.friction == fixed.friction and np.all(one.stiffness == 1.0)
-    with pytest.raises(HandError, match="friction = 'outsid'"):
-        sample_trial("grasp", np.random.default_rng(0), overrides={"friction": "outsid"})
     with pytest.raises(HandError, match="no parameter 'gaer_play'"):
         sample_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
 

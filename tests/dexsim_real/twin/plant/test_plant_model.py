@@ -15,8 +15,6 @@ from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import TipContact
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 
-FINGERS = ("thumb", "index", "middle", "ring", "little")
-
 
 @pytest.fixture(scope="module")
 def text():
@@ -85,32 +83,16 @@ def test_a_parameter_that_the_file_decides_cannot_be_set(hand):
         plant(hand, friction=0.5)
 
 
-def test_a_toml_names_what_cannot_be_found(hand, text, write):
-    """Actuators in another order, tips without a name to find them by, a palm frame that is a site."""
-    words = text.replace('<position class="strong" joint="thumb_swing"/>', "").replace(
-        "</actuator>", '<position class="strong" joint="thumb_swing"/></actuator>'
+def test_a_site_is_the_palm_and_a_tip_is_found_by_its_name(hand, text, write):
+    words = text.replace('<body name="hand">', '<body name="hand"><site name="palm" pos="0 0 .1"/>')
+    with pytest.raises(HandError, match="with all joints at 0 the tip of .* is 100 mm from"):
+        read_model(write(words), hand)
+    words = words.replace("0 0 .1", "0 0 0").replace(
+        '<site name="middle_tip"', '<site name="screw"/><site name="middle_tip"'
     )
-    for name in FINGERS:
-        words = words.replace(f'site name="{name}_tip"', f'site name="{name}_x"')
-    words = words.replace('<body name="hand">', '<body name="hand"><site name="palm"/>')
-    words = words.replace('<site name="middle_x"', '<site name="screw" pos="0 0 0"/><site name="middle_x"')
-    path = write(words)
-    with pytest.raises(HandError, match="has a range of"):  # By order the joints are wrong.
-        read_model(path, hand)
-    joints = [n for n in words.split('"') if n.endswith(("_swing", "_flex", "_curl", "_spread"))][:12]
-    names, tips = f"joints = {joints}\n", f"tips = {[f'{name}_x' for name in FINGERS]}\n"
-    model = read_model(write(f'model = "hand.xml"\npalm = "palm"\n{names}{tips}', "hand.toml"), hand)
-    assert [name.removeprefix("plant/") for name in model.joints] == joints
-    for lines, says in (
-        (f'{names}{tips}palm = "q"', "neither a body nor a site 'q'"),
-        (f'{names}tips = ["a"]', "0 fingertip sites of thumb"),
-        (f"{names}", "0 fingertip sites of middle"),
-        (f'joints = ["a"]\n{tips}', "1 joints, the hand has 12"),
-        (f"{names}tip = 1", "'tip'"),
-        ("palm =", "Invalid value"),
-    ):
-        with pytest.raises(HandError, match=says):
-            read_model(write(f'model = "hand.xml"\n{lines}\n', "bad.toml"), hand)
+    assert len(read_model(write(words), hand).lattices) == 5
+    with pytest.raises(HandError, match="0 fingertip sites of middle"):
+        read_model(write(words.replace("middle_tip", "middle_x")), hand)
 
 
 @pytest.mark.parametrize(("slope", "priority"), [(0.45, 0), (0.7, -1)])

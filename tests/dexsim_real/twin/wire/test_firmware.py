@@ -79,7 +79,7 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     board = Firmware(plant)
     for kelvin, hot in ((50.0, False), (65.0, True), (54.0, True), (49.0, False)):  # 85, 100, 89 and 84 degrees
         board.faults.clear()
-        board.begin(Fault("heat", {"part": "4", "kelvin": kelvin}), now=0.0)
+        board.begin(Fault(kind="heat", part="4", kelvin=kelvin), now=0.0)
         state = frames.decode_state(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()

@@ -32,9 +32,9 @@ def test_faults_at_given_times_come_in_order_with_their_values():
     injector = Injector(lines)
     sampled = [(round(k * 0.1, 1), injector.sample(50 + k * 0.1)) for k in range(30)]
     (_, drop), (_, gone), (_, stuck), (when, heat), (_, off) = [(t, fault) for t, fault in sampled if fault]
-    assert str(drop) == "drop request" and gone == Fault("disconnect", {"seconds": 0.7})
-    assert stuck == Fault("stuck", {"tip": 4, "taxel": 7, "count": 88}) and when == 2.1
-    assert str(heat) == "heat 3 40.0 1.5" and off == Fault("off", {"joint": ALL, "seconds": 2.0})
+    assert str(drop) == "drop request" and gone == Fault(kind="disconnect", seconds=0.7)
+    assert stuck == Fault(kind="stuck", tip=4, taxel=7, count=88) and when == 2.1
+    assert str(heat) == "heat 3 40.0 1.5" and off == Fault(kind="off", joint=ALL, seconds=2.0)
     assert injector.injected == {"drop request": 1, "disconnect": 1, "heat": 1, "stuck": 1, "off": 1}
     assert 0.1 <= injector.sample(60).seconds <= 0.15  # Drawn, where the line says nothing.
 
