@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shlex
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,7 @@ from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.core.errors import DexsimError
 from dexsim.hand.source import record_of
+from dexsim.registry import task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
@@ -209,6 +211,8 @@ class Run:
     def _evaluate(self, state: TrainState, iteration: int) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
+        if not self.evaluations_s:
+            processes.print_on_first("evaluating, to keep the best policy; the first evaluation compiles for a minute")
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
         score, first, best = figures["return"], next(iter(figures)), self.best["return"]
@@ -260,7 +264,8 @@ class Run:
         `command` is what started the run, for the report.
         """
         arguments, folder, selected = self.arguments, self.folder, self.selected
-        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing", flush=True)
+        first = "" if self.evaluations_s else "; the first evaluation compiles for about a minute"
+        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing{first}", flush=True)
         begin = time.perf_counter()
         trained, untrained = load_policy(selected), load_policy(folder.untrained)
         if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
@@ -286,12 +291,16 @@ class Run:
         } | cli.environment_report()
         folder.keep_report()
         cli.write_json(folder.report, report)
-        for name, policy in (("untrained", "untrained"), ("trained", selected)):
-            print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
+        print_report(reports["trained"], reports["do_nothing"], title=f"{arguments.task}: {selected.name}")
         print(f"report: {folder.report}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
-            print("rendering the video", flush=True)
+            print("rendering the video: a minute on two cores", flush=True)
             print(f"video: {write_video(self.evaluator.env, film, folder.path / 'policy.mp4')}")
+        module = task_option(arguments.task)
+        if hasattr(self.env, "hand") and not module:
+            print(f"see it in the browser: dexsim view {shlex.quote(str(selected))}")
+        resume = f"dexsim train --resume {shlex.quote(str(folder.path))}{module}"
+        print(f"train longer: {resume}, with a larger --minutes or --steps")
 
 
 class Faults:
