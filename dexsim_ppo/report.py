@@ -73,16 +73,16 @@ def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, t
     idle = do_nothing and headline(do_nothing)
     table = Table("measure", "policy", "95 % interval", *(["doing nothing"] if idle else []), title=title)
     for name, entry in headline(report).items():
-        low, high, unit = entry.get("low"), entry.get("high"), entry.get("unit", "")
-        span = "" if low is None or high is None else f"{_written(low, unit)} .. {_written(high, unit)}"
-        beside = [_written(idle.get(name, {}).get("value"), unit)] if idle else []
-        table.add_row(name, _written(entry["value"], unit), span, *beside)
+        low, high = (written(entry | {"value": entry.get(end)}) for end in ("low", "high"))
+        beside = [written(idle.get(name, {"value": None}))] if idle else []
+        table.add_row(name, written(entry), f"{low} .. {high}" if entry.get("high") is not None else "", *beside)
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
 
 
-def _written(value: float | None, unit: str) -> str:
-    """A number with its unit; a share [0, 1] in per cent."""
+def written(entry: dict[str, Any]) -> str:
+    """A headline's number with its unit; a share [0, 1] in per cent."""
+    value, unit = entry["value"], entry.get("unit", "")
     if value is None:
         return "-"
     return f"{100 * value:.1f} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()

@@ -27,7 +27,7 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import headline, print_report, significantly_better
+from dexsim_ppo.report import headline, print_report, significantly_better, written
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.fine_tune import initialize_from
@@ -213,8 +213,10 @@ class Run:
         policy = self._policy(state)
         if not self.evaluations_s:
             processes.print_on_first("evaluating, to keep the best policy; the first evaluation compiles for a minute")
-        report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
-        figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
+        label, episodes = "evaluation" if processes.is_first() else "", self.arguments.evaluation_chunk
+        report, _ = self.evaluator(policy.params, episodes=episodes, seed=SELECTION_SEED, label=label)
+        entries = {name: entry for name, entry in headline(report).items() if entry["value"] is not None}
+        figures = {name: entry["value"] for name, entry in entries.items()}
         score, first, best = figures["return"], next(iter(figures)), self.best["return"]
         self.evaluations_s.append(report["seconds"])
         better = best is None or best != best or score > best  # Nothing is better than NaN, and NaN than nothing.
@@ -223,7 +225,7 @@ class Run:
             self.best = {"return": score, "iteration": iteration}
             self._write_policy(policy, self.folder.best)
         processes.print_on_first(
-            f"evaluation at iteration {iteration}: {first} {figures[first]:.3g}, return {score:.2f}"
+            f"evaluation at iteration {iteration}: {first} {written(entries[first])}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
             f"({report['seconds']:.1f} s)"
         )

@@ -110,7 +110,7 @@ def _headline(report: dict) -> dict:
         "r, normal force": entry(report["r_normal"]),
         "r, force on the taxels": entry(report["r_taxels"]),
         "r, force on the taxels, worst shape": min((r for r in by_shape if r is not None), default=None),
-        "time with a joint at its torque limit": entry(report["torque_limited"]) | {"unit": "%"},
+        "time at a torque limit": entry(report["torque_limited"]) | {"unit": "%"},
     }
 
 

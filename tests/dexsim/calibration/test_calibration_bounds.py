@@ -98,7 +98,7 @@ DAMAGED = [
     ("[-0.05,", '["a",', "damaged"),
     ("force_per_count = [", "force_per_count = [0.1, ", "'force_per_count' must hold 5 numbers"),
     ("friction = ", "fiction = ", "unknown entry 'fiction'"),
-    ("version = 2", "version = 1", "it has version 1, this library reads 2"),
+    ("version = 2", "version = 1", "expected version 2, got 1"),
     ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
     ('"thumb_bend"', '"thumb_bent"', "calibrate this hand"),
     ("xhand_right", "x" * 5000, "is of hand 'x+"),
