@@ -23,7 +23,8 @@ _METRES_PER_NEWTON = 0.006  # length of a force's arrow
 _GOAL_AT = 0.10  # m above the object, where the goal is shown
 _AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
 _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
-_FLOOR = 0.22  # m below the point that the camera looks at
+_ABOVE = 8.0  # deg, lowest elevation of the camera at first
+_FLOOR = 0.2  # m below the point that the camera looks at
 
 
 class Scene:
@@ -48,8 +49,9 @@ class Scene:
             section_color=(78, 84, 94),
             position=tuple(np.asarray(view.target) - _FLOOR * self._up),
         )
-        # Farther away than a film's camera, and to the right: the controls cover that part of the page.
-        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
+        # Above the floor, farther away than a film's camera, and to the right: the controls cover that part of the page.
+        above = max(view.elevation, _ABOVE)
+        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance, elevation=above), (4, 3))
         aside = _ASIDE * eye.axes[0]
         server.initial_camera.position = tuple(eye.origin + aside)
         server.initial_camera.look_at = tuple(view.target + aside)
