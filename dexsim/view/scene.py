@@ -49,7 +49,7 @@ class Scene:
             section_color=(78, 84, 94),
             position=tuple(np.asarray(view.target) - _FLOOR * self._up),
         )
-        # Above the floor, farther away than a film's camera, and to the right: the controls cover that part of the page.
+        # Above the floor, farther away than a film's camera, and aside: the controls cover a part of the page.
         above = max(view.elevation, _ABOVE)
         eye = look(dataclasses.replace(view, distance=_AWAY * view.distance, elevation=above), (4, 3))
         aside = _ASIDE * eye.axes[0]
