@@ -90,8 +90,7 @@ class HandNode:
         if policy:
             controller = Controller(policy, calibrated_hand(hand, calibration))
             if "imu" in controller.sources:
-                what = f"{given['policy']} observes the object's orientation, which this node does not measure"
-                raise HandError(f"{what}: use `python -m dexsim_real.run`")
+                raise HandError(f"{given['policy']} observes the object's orientation: use `python -m dexsim_real.run`")
             controller.check_measured(missing_of(self.port))
             controller.warm()
             limits = limits_for(limits, controller)
