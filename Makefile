@@ -3,6 +3,7 @@
 #
 #   make train ARGS="--steps 2e6"     options of `python -m dexsim_ppo.train`
 #   make docs                         the documentation site, in site/
+#   make figures                      the pictures of the documentation, anew; ARGS="skin films" for some
 #   make test ARGS="-k touch"         options of pytest (which runs on two processes)
 #   make mutants ARGS="--seed 1"      an hour of small changes in the code: do the tests notice?
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
@@ -25,7 +26,7 @@ DOCUMENTABLE := $(VENV)/.documentable
 LINTABLE := $(VENV)/.lintable
 MUTABLE := $(VENV)/.mutable
 
-.PHONY: train test mutants lint docs clean help
+.PHONY: train test mutants lint docs figures clean help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -48,6 +49,9 @@ lint: $(LINTABLE)
 
 docs: $(DOCUMENTABLE)
 	$(PY) -m mkdocs build --strict $(ARGS)
+
+figures: $(TESTABLE)
+	$(PY) docs/images/figures.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) dist site .cache .pytest_cache .ruff_cache

@@ -132,7 +132,7 @@ def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "qu
     from dexsim.render.render import render_episode
 
     if not jax.tree.leaves(snapshots):
-        raise ConfigError(f"--video {path}: {env.name!r} draws nothing")
+        raise ConfigError(f"--video {path}: {env.name!r} cannot be drawn")
     fps = 1.0 / env.control_period
     seconds = jax.tree.leaves(snapshots)[0].shape[0] / fps
     # At fewer than eight pictures a second a gait cannot be followed.

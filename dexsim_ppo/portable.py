@@ -103,7 +103,7 @@ def read_file(path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np
         raise ValueError("is cut short")
     _, version, size = PREFIX.unpack_from(data)
     if version != FORMAT_VERSION:
-        raise ValueError(f"has format version {version}, this dexsim reads {FORMAT_VERSION}")
+        raise ValueError(f"has format version {version}, expected {FORMAT_VERSION}")
     if digest(data[: PREFIX.size], data[_START:]) != bytes(data[PREFIX.size : _START]):
         raise ValueError("is cut short or damaged (its checksum is wrong)")
     header, offset = msgpack.unpackb(data[_START : _START + size]), _START + size

@@ -71,20 +71,26 @@ def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, t
     from rich.table import Table
 
     idle = do_nothing and headline(do_nothing)
-    number = lambda value: "-" if value is None else f"{value:.4g}"  # noqa: E731
-    table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
+    table = Table("measure", "policy", "95 % interval", *(["doing nothing"] if idle else []), title=title)
     for name, entry in headline(report).items():
-        low, high = entry.get("low"), entry.get("high")
-        span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
-        beside = [number(idle.get(name, {}).get("value"))] if idle else []
-        table.add_row(name, number(entry["value"]), span, *beside)
+        low, high = (written(entry | {"value": entry.get(end)}) for end in ("low", "high"))
+        beside = [written(idle.get(name, {"value": None}))] if idle else []
+        table.add_row(name, written(entry), f"{low} .. {high}" if entry.get("high") is not None else "", *beside)
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
 
 
+def written(entry: dict[str, Any]) -> str:
+    """A headline's number with its unit; a share [0, 1] in per cent."""
+    value, unit = entry["value"], entry.get("unit", "")
+    if value is None:
+        return "-"
+    return f"{100 * value:.1f} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
+
+
 def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Names of the task's headline, or else the share held, and the return: value, low and high."""
-    own = report["task"].get("headline") or {"held": report["held"]}
+    """Names of the task's headline, or else the share held, and the return: value, low, high and unit."""
+    own = report["task"].get("headline") or {"held": report["held"] | {"unit": "%"}}
     rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in own.items()}
     return rows | {"return": report["return"]}
 

@@ -2,9 +2,8 @@
 
     python -m dexsim_ppo.train --task grasp
 
-Writes `runs/<task>-<time>/`: configuration, metrics, checkpoints, best and last policy, learning curve,
-and at the end `report.json` (trained against untrained, same episodes) and a video. Ctrl-C saves, and
-`--resume` goes on exactly from there.
+Writes `runs/<task>-<time>/`: configuration, metrics, checkpoints, best and last policy, learning curve, and at the end
+`report.json` (trained and untrained policy, same episodes) and a video. Ctrl-C saves; `--resume` continues exactly.
 """
 
 import argparse
@@ -150,7 +149,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def make_run(arguments: TrainArguments, source: Source, started: float, command: str) -> Run:
     """A run with its folder, ready to train."""
     resumed, first = source if isinstance(source, checkpoint.Checkpoint) else None, processes.is_first()
-    # What is wrong is said before the environment is made.
+    # Errors come before the environment is made, which takes seconds.
     if resumed and arguments.run_dir:
         raise ConfigError(f"--run-dir {arguments.run_dir}: a resumed run stays in its folder")
     if first:
@@ -159,7 +158,7 @@ def make_run(arguments: TrainArguments, source: Source, started: float, command:
         require("wandb", "wandb", f"--wandb {arguments.wandb}")
     if arguments.deterministic and not make_deterministic():
         processes.print_on_first(
-            "--deterministic changes nothing here: without a GPU, runs repeat to the last bit anyway"
+            "--deterministic has no effect without a GPU, where runs of one seed are bit-identical anyway"
         )
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, source)
     processes.print_on_first(f"making the environment of {arguments.task}")

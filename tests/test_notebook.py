@@ -22,7 +22,7 @@ EXPECTED = {
         4,
         ["12 joints, 5 fingers with 120 taxels each", "environment steps per second", r"trained +\d\.\d\d"],
     ),
-    "shipped_policies": (2, [r"\d+ of \d+ objects held for 8 s", r"true force: Pearson r = 0\.[5-9]"]),
+    "shipped_policies": (2, [r"\d+ of \d+ objects held for 8 s", r"contact force: Pearson r = 0\.[5-9]"]),
     "touch": (3, [r"N at first, 2\.0\d N after 25 steps", r"surface_points +median error +\d+\.\d um"]),
     "own_task": (2, ["level level 0.3", r"level = 1\.0 \(trained: 0\.3\)"]),
     "motors": (3, [r"12 joints pressed, torque at 0\.3 A off by [0-5]\.\d %", "2 sub-steps of 5 ms"]),

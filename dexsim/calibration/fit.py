@@ -90,7 +90,7 @@ def _side(hand: Hand, lines: Mapping[int, JointLines], where: str) -> Side:
         odd = [other for other in mates if measured[other]["gain"][0] * measured[mates[0]]["gain"][0] < 0]
         if odd:  # Their mean may be next to nothing.
             raise CalibrationError(
-                f"gain signs differ {where} between {names[odd[0]]} and {names[mates[0]]}: no mean of both can stand "
+                f"gain signs differ {where} between {names[odd[0]]} and {names[mates[0]]}: their mean cannot stand in "
                 f"for {names[joint]}; check the wiring, or record {names[joint]}"
             )
         rows.append({key: np.mean([measured[other][key] for other in mates], 0) for key in measured[mates[0]]})

@@ -214,7 +214,7 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
 def _calibration(table: dict[str, Any]) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
     if table["format"] != FORMAT or table["version"] != VERSION:
-        raise ValueError(f"it has version {table['version']!r:.20}, this library reads {VERSION}")
+        raise ValueError(f"expected version {VERSION}, got {table['version']!r:.20}")
     _refuse_unknown(table, "format", "version", *_WORDS, *_UNITS, "real", "sim")
     words: dict[str, Any] = {
         name: tuple(map(str, v)) if isinstance(v := table[name], list) else str(v) for name in _WORDS

@@ -57,7 +57,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: str, default: T | None = None) -> T:
-    """Options of a dataclass (None: of this process), through tyro: it answers `--help`, refuses what does not parse.
+    """Parse options into a dataclass with tyro, which handles `--help` and invalid values; None: this process's `argv`.
 
     Raises:
       ConfigError: a value is out of range; names the option's class and field.
@@ -69,7 +69,7 @@ def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: s
 
 
 def announce(text: str) -> None:
-    """Say on standard error what takes seconds, before it is done; not above a help page."""
+    """Print to standard error what will take seconds; nothing above a help page."""
     if not wants_help(sys.argv):
         print(text, file=sys.stderr, flush=True)
 
@@ -111,10 +111,10 @@ def environment_report() -> dict[str, Any]:
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of a file that is to be written after long work, and see that the file can be.
+    """Check, before long work, that a file can be written after it; make its folder.
 
     Raises:
-      OSError: it cannot.
+      OSError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
@@ -125,11 +125,10 @@ def check_writable(path: Path) -> None:
 
 
 def check_no_overwrite(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
-    """Check that no file which a command writes (by option) is one that it reads (by what that is), or another one that
-    it writes.
+    """Check that a command writes (files by option) neither a file that it reads (files by meaning) nor one file twice.
 
     Raises:
-      ConfigError: there is such a file.
+      ConfigError: it does.
     """
     taken = {os.path.realpath(path): f"is the {what}" for what, path in inputs.items() if path and Path(path).is_file()}
     for option, path in outputs.items():

@@ -189,7 +189,8 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict[str, Any]:
         """An evaluation's report: plain data that JSON can hold. "headline" maps names to what is
-        printed, figures that a hand that does nothing fails: numbers, or dictionaries with "value", "low" and "high".
+        printed, figures that a hand that does nothing fails: numbers, or dictionaries with "value", "low" and "high",
+        and a "unit" to print; "%" is that of a share.
 
         Args:
           metrics: the environment's, by name. For "series" [T, N], zero once an episode has ended; for "totals" [N],

@@ -80,7 +80,7 @@ def read_description(
     try:
         root = ElementTree.fromstring(path.read_bytes())
     except ElementTree.ParseError as error:
-        raise AssetError(f"{path}: no XML: {error}") from None
+        raise AssetError(f"{path}: invalid XML: {error}") from None
     if root.tag not in ("robot", "mujoco"):
         raise AssetError(f"{path}: expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
     notes: list[str] = []
@@ -235,7 +235,7 @@ class _Reader:
         joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
         for j in joints:
             if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise AssetError(f"{self.path}: joint {names[j]!r} is no hinge: --freeze {names[j]} fixes it at 0")
+                raise AssetError(f"{self.path}: joint {names[j]!r} is not a hinge: --freeze {names[j]} fixes it at 0")
         followers = self._followers(names, joints, couple)
         torques = self._torques()
         axes, anchors = self.data.xaxis.copy(), self.data.xanchor.copy()

@@ -6,7 +6,7 @@ Color = tuple[int, int, int]
 
 PALM: Color = (62, 66, 72)
 LINK: Color = (172, 176, 182)
-TIP: Color = (76, 79, 84)
+TIP: Color = (58, 98, 92)
 OBJECT: Color = (52, 128, 172)
 FACES: tuple[Color, ...] = (
     (230, 159, 0),

@@ -21,7 +21,7 @@ _INFERNO = """
 1e0c45 380962 510e6c 69166e 801f6c 982766 b0315b c63d4d d94d3d e9612b f47918 fa9407 fcb014 f8cd37 f2ea69 fcffa4
 """
 _GAP = 1  # pixels between two cells
-TRUE, FELT = ("maps: felt force", "bars: true force"), ("maps: felt force", "bars: their sum")
+TRUE, FELT = ("maps: taxel force", "bars: contact force"), ("maps: taxel force", "bars: their sum")
 """Captions of a panel whose bars show the simulation's contact forces, or what the taxels feel."""
 
 

@@ -222,8 +222,8 @@ def _paint_taxels(
     radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
     width, height = view.size
     for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
-        left, right = max(int(x - r), 0), min(int(x + r) + 2, width)
-        top, bottom = max(int(y - r), 0), min(int(y + r) + 2, height)
+        left, right = np.clip((int(x - r), int(x + r) + 2), 0, width)
+        top, bottom = np.clip((int(y - r), int(y + r) + 2), 0, height)
         rows, columns = np.ogrid[top:bottom, left:right]
         disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
         disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT

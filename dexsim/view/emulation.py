@@ -29,7 +29,7 @@ class Emulation:
         policy = load_policy(name)
         self.hand = policy.find_hand(hand) or load_hand()
         if policy.task not in TASKS:
-            raise HandError(f"{name}: the emulated hand has the tasks {' and '.join(TASKS)}, not {policy.task!r}")
+            raise HandError(f"{name}: expected a policy of {' or '.join(TASKS)}, got {policy.task!r}")
         check_wire(self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()

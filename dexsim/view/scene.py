@@ -23,6 +23,8 @@ _METRES_PER_NEWTON = 0.006  # length of a force's arrow
 _GOAL_AT = 0.10  # m above the object, where the goal is shown
 _AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
 _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
+_ABOVE = 8.0  # deg, lowest elevation of the camera at first
+_FLOOR = 0.2  # m below the point that the camera looks at
 
 
 class Scene:
@@ -36,8 +38,20 @@ class Scene:
         server.scene.set_up_direction(view.up)
         server.scene.configure_default_lights(True, cast_shadow=False)
         server.scene.add_light_ambient("/light", intensity=1.2)
-        # Farther away than a film's camera, and to the right: the controls cover that part of the page.
-        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
+        server.scene.add_grid(
+            "/floor",
+            width=1.2,
+            height=1.2,
+            plane="yz",  # Every preset's up is along x.
+            cell_size=0.05,
+            section_size=0.2,
+            cell_color=(52, 56, 64),
+            section_color=(78, 84, 94),
+            position=tuple(np.asarray(view.target) - _FLOOR * self._up),
+        )
+        # Above the floor, farther away than a film's camera, and aside: the controls cover a part of the page.
+        above = max(view.elevation, _ABOVE)
+        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance, elevation=above), (4, 3))
         aside = _ASIDE * eye.axes[0]
         server.initial_camera.position = tuple(eye.origin + aside)
         server.initial_camera.look_at = tuple(view.target + aside)
@@ -151,10 +165,10 @@ def primitive(kind: str, size: np.ndarray) -> trimesh.Trimesh:
     if kind == "box":
         return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
     if kind == "capsule":
-        return trimesh.creation.capsule(radius=a, height=2 * b, count=(24, 16))
+        return trimesh.creation.capsule(radius=a, height=2 * b, count=(48, 32))
     if kind == "cylinder":
-        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=32)
-    ball = trimesh.creation.icosphere(subdivisions=3)
+        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=64)
+    ball = trimesh.creation.icosphere(subdivisions=4)
     ball.apply_scale((a, b, c) if kind == "ellipsoid" else a)
     return ball
 

@@ -17,6 +17,7 @@ from dexsim.view.source import Choice, Control, Frame, Slider, Source
 
 _PANEL = (300, 560)  # pixels of the taxel maps
 _READ_OUT = 0.2  # s between two updates of text and maps: they cost more than the scene
+_FADE = 3.0  # s, in which the scales of force fall to 1/e
 _CHOICES = 3.0  # s between two looks for new choices
 
 
@@ -36,14 +37,14 @@ class Viewer:
         except OSError as error:
             raise DexsimError(f"host {host!r:.100}: no page can be served there ({error.strerror or error})") from None
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.
-            self.server = viser.ViserServer(host=host, port=port, label=title)
+            self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
         self.scene = Scene(self.server, hand, source.camera)
         self._layout: Layout = make_layout(*_PANEL, hand.taxel_grid, hand.num_fingers)
         self._clicked: set[str] = set()
         self._handles: dict[str, Any] = {}
         self._controls: dict[str, Control] = {}
-        # The scale follows the largest taxel and finger force seen so far.
+        # The scales follow the largest taxel and finger force of the last seconds.
         self._taxel_range, self._finger_range, self._read_out_at, self._looked_at = 0.05, 1.0, 0.0, 0.0
         gui = self.server.gui
         self._text = gui.add_markdown("")
@@ -115,13 +116,16 @@ class Viewer:
         # On a hand nothing measures the true force: every source shows what the taxels feel.
         total = np.asarray(frame.snapshot.taxel_force).sum(-1)
         snapshot = dataclasses.replace(frame.snapshot, finger_force=total)
-        self._taxel_range = max(self._taxel_range, float(np.max(snapshot.taxel_force)))
-        self._finger_range = max(self._finger_range, float(np.max(total)))
+        fade = np.exp(-self.source.period / _FADE)
+        self._taxel_range = max(0.05, fade * self._taxel_range, float(np.max(snapshot.taxel_force)))
+        self._finger_range = max(1.0, fade * self._finger_range, float(np.max(total)))
         self.scene.show(frame, self._taxel_range)
         if time.monotonic() < self._read_out_at + _READ_OUT:
             return
         self._read_out_at = time.monotonic()
         words = read_outs(snapshot) | ({"state": frame.note} if frame.note else {})
+        if "command" in self._handles and "command" in words:  # The force loop adds to what the user has set.
+            words["command"] = f"{self._handles['command'].value:.2f}, with the force loop {words['command']}"
         self._text.content = "  \n".join(f"{name}: **{word}**" for name, word in words.items())
         self._maps.image = draw_panel(
             self._layout,

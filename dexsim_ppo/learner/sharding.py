@@ -39,7 +39,7 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
     count = devices or len(available)
     if count > len(available) or (jax.process_count() > 1 and count < len(available)):
         raise ConfigError(
-            f"TrainArguments.devices = {devices}: there are {len(available)}, in {jax.process_count()} processes"
+            f"TrainArguments.devices = {devices}: expected at most {len(available)} in {jax.process_count()} processes"
         )
     if config.num_envs % count:
         raise ConfigError(f"PPOConfig.num_envs = {config.num_envs}: must be a multiple of the {count} devices")

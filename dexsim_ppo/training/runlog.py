@@ -58,7 +58,7 @@ class RunFolder:
     def latest_checkpoint(self) -> Path:
         """The newest checkpoint; raises CheckpointError if there is none."""
         if not (paths := self.existing_checkpoints()):
-            raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
+            raise CheckpointError(f"{self.path}: has no checkpoint to resume from")
         return paths[-1]
 
     def prune(self, keep: int) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shlex
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,7 @@ from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.core.errors import DexsimError
 from dexsim.hand.source import record_of
+from dexsim.registry import task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
@@ -25,7 +27,7 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import headline, print_report, significantly_better
+from dexsim_ppo.report import headline, print_report, significantly_better, written
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.fine_tune import initialize_from
@@ -210,8 +212,12 @@ class Run:
     def _evaluate(self, state: TrainState, iteration: int) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
-        report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
-        figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
+        if not self.evaluations_s:
+            processes.print_on_first("evaluating, to keep the best policy; the first evaluation compiles for a minute")
+        label, episodes = "evaluation" if processes.is_first() else "", self.arguments.evaluation_chunk
+        report, _ = self.evaluator(policy.params, episodes=episodes, seed=SELECTION_SEED, label=label)
+        entries = {name: entry for name, entry in headline(report).items() if entry["value"] is not None}
+        figures = {name: entry["value"] for name, entry in entries.items()}
         score, first, best = figures["return"], next(iter(figures)), self.best["return"]
         self.evaluations_s.append(report["seconds"])
         better = best is None or best != best or score > best  # Nothing is better than NaN, and NaN than nothing.
@@ -220,7 +226,7 @@ class Run:
             self.best = {"return": score, "iteration": iteration}
             self._write_policy(policy, self.folder.best)
         processes.print_on_first(
-            f"evaluation at iteration {iteration}: {first} {figures[first]:.3g}, return {score:.2f}"
+            f"evaluation at iteration {iteration}: {first} {written(entries[first])}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
             f"({report['seconds']:.1f} s)"
         )
@@ -261,7 +267,8 @@ class Run:
         `command` is what started the run, for the report.
         """
         arguments, folder, selected = self.arguments, self.folder, self.selected
-        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing", flush=True)
+        first = "" if self.evaluations_s else "; the first evaluation compiles for about a minute"
+        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing{first}", flush=True)
         begin = time.perf_counter()
         trained, untrained = load_policy(selected), load_policy(folder.untrained)
         if trained.training.get("iteration") == 0:
@@ -287,12 +294,16 @@ class Run:
         } | cli.environment_report()
         folder.keep_report()
         cli.write_json(folder.report, report)
-        for name, policy in (("untrained", "untrained"), ("trained", selected)):
-            print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
+        print_report(reports["trained"], reports["do_nothing"], title=f"{arguments.task}: {selected.name}")
         print(f"report: {folder.report}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
-            print("rendering the video", flush=True)
+            print("rendering the video: a minute on two cores", flush=True)
             print(f"video: {write_video(self.evaluator.env, film, folder.path / 'policy.mp4')}")
+        module = task_option(arguments.task)
+        if hasattr(self.env, "hand") and not module:
+            print(f"see it in the browser: dexsim view {shlex.quote(str(selected))}")
+        resume = f"dexsim train --resume {shlex.quote(str(folder.path))}{module}"
+        print(f"train longer: {resume}, with a larger --minutes or --steps")
 
 
 class Faults:

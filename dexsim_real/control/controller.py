@@ -70,7 +70,7 @@ class Controller:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
         zeros = np.zeros(sum(entry.size for entry in expected), np.float32)
         if (shape := np.shape(policy.act(policy.initial_carry(), zeros)[1])) != (hand.num_joints,):
-            raise HandError(f"the policy gives actions {list(shape)}; the hand takes {hand.num_joints} of them")
+            raise HandError(f"expected a policy with actions [{hand.num_joints}], got {list(shape)}")
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
         self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))

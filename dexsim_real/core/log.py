@@ -184,9 +184,7 @@ def reading(path: str | Path) -> Iterator[None]:
     except DexsimError:
         raise
     except Exception as error:
-        raise LogError(
-            f"{path}: a record is not as the bridge writes it ({type(error).__name__}: {error}); record again"
-        ) from error
+        raise LogError(f"{path}: invalid record ({type(error).__name__}: {error}); record again") from error
 
 
 def _decode(data: bytes, at: int) -> tuple[Record | None, int]:

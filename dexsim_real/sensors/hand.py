@@ -124,7 +124,7 @@ class HandSensing:
             if len(data) == block.itemsize:
                 return frames.decode_state(data, block)
         raise HandError(
-            f"a logged state of {len(data)} bytes is of another hand than {self.hand.name}: give its --hand"
+            f"expected states of {self.hand.name}, got one of {len(data)} bytes: give the log's hand with --hand"
         )
 
     def measure(self, state: np.ndarray) -> HandMeasurement:

@@ -303,4 +303,4 @@ def _decode(data: bytes, dtype: np.dtype) -> np.ndarray:
 
 def _check_ids(ids: np.ndarray) -> None:
     if not np.array_equal(ids, np.arange(len(ids))):
-        raise FrameError(f"block with joint ids {ids.tolist()}")
+        raise FrameError(f"expected joint ids 0 to {len(ids) - 1} in order, got {ids.tolist()}")

@@ -78,7 +78,10 @@ def commands() -> str:
     for name, (module, purpose) in COMMANDS.items():
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-            importlib.import_module(module).main(["--help"])
+            try:
+                importlib.import_module(module).main(["--help"])
+            except ModuleNotFoundError:  # ROS 2, which no package index has
+                print(importlib.import_module(module).__doc__)
         title = purpose[0].upper() + purpose[1:]
         pages += [
             "",

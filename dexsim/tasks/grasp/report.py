@@ -99,14 +99,14 @@ def _headline(report: dict) -> dict:
     start, end = report["window_s"]
     by_shape = [row["r_taxels"]["r"] for row in report["by_shape"]]
     return {
-        "held": entry(report["held"]),
-        "held at worst command": min(row["held"]["mean"] for row in report["by_command"]),
-        "force error, 0 N where lost (N)": entry(report["force_error_n"]),
-        f"r, resultant force ({start:.3g} to {end:.3g} s)": entry(report["r_resultant"]),
+        "held": entry(report["held"]) | {"unit": "%"},
+        "held at the worst command": {"value": min(row["held"]["mean"] for row in report["by_command"]), "unit": "%"},
+        "force error, 0 N if lost": entry(report["force_error_n"]) | {"unit": "N"},
+        f"r, contact force, {start:.0f} to {end:.0f} s": entry(report["r_resultant"]),
         "r, normal force": entry(report["r_normal"]),
         "r, force on the taxels": entry(report["r_taxels"]),
         "r, force on the taxels, worst shape": min((r for r in by_shape if r is not None), default=None),
-        "ticks with a joint at its torque limit": entry(report["torque_limited"]),
+        "time at a torque limit": entry(report["torque_limited"]) | {"unit": "%"},
     }
 
 

@@ -97,7 +97,7 @@ DAMAGED = [
     ("[-0.05,", '["a",', "damaged"),
     ("force_per_count = [", "force_per_count = [0.1, ", "'force_per_count' must hold 5 numbers"),
     ("friction = ", "fiction = ", "unknown entry 'fiction'"),
-    ("version = 3", "version = 1", "it has version 1, this library reads 3"),
+    ("version = 3", "version = 1", "expected version 3, got 1"),
     ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
     ('"thumb_bend"', '"thumb_bent"', "calibrate this hand"),
     ("xhand_right", "x" * 5000, "is of hand 'x+"),

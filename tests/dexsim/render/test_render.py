@@ -159,6 +159,20 @@ def test_a_loaded_taxel_shows_on_the_finger(hand):
     assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
 
 
+def test_taxels_outside_a_picture_change_nothing_in_it(hand):
+    """A narrow picture is the middle of a wide one, in which fingertips are to the left and right of it."""
+    force = np.ones(hand.taxel_position.shape[:2], np.float32)
+    hot, cold = (snapshot(hand, active=None, force=f) for f in (force, 0 * force))
+
+    def taxels(width):
+        frames = [render.render_frame(hand, KINDS, s, size=(width + 120, 240), force_range=1.0) for s in (hot, cold)]
+        return (frames[0] != frames[1]).any(-1)[:, :width]
+
+    narrow, wide = taxels(60), taxels(260)
+    np.testing.assert_array_equal(narrow, wide[:, 100:160])
+    assert narrow.any() and wide[:, :100].any() and wide[:, 160:].any()
+
+
 def quarter(axis):
     """A quarter turn about an axis."""
     turn = np.roll(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), axis + 1, (0, 1))

@@ -21,7 +21,7 @@ from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_me
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
-    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+    with pytest.raises(CheckpointError, match="has no checkpoint"):
         folder.latest_checkpoint()
     for iteration in (900, 20, 1000, 100):
         folder.checkpoint(iteration).touch()

@@ -131,7 +131,7 @@ def forged(folder):
                 if record.kind == kind and name in content:
                     content = {**content, name: value}
                 log.add(record.kind, content, record.time)
-        with pytest.raises(LogError, match=f"^{path}: a record is not as the bridge writes it") as error:
+        with pytest.raises(LogError, match=f"^{path}: invalid record") as error:
             replay.replay(path)
         assert "\n" not in str(error.value)
 

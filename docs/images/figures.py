@@ -1,0 +1,246 @@
+"""Every picture of the documentation that the code makes: `make figures`.
+
+README's animation, films of the shipped policies, the live view, and the figures of the results. Figures of results are
+drawn from the reports in docs/results. Two kinds are kept as they were measured: learning curves, copied from the run
+that a policy is of, and contact points.
+
+python docs/images/figures.py [NAME ...]
+"""
+
+import dataclasses
+import io
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dexsim
+from dexsim.core import cli
+from dexsim.core.config import from_dict, override
+from dexsim.render.render import render_frame
+from dexsim_ppo import evaluate, load_policy
+
+ROOT = Path(__file__).resolve().parents[2]
+IMAGES, RESULTS = ROOT / "docs" / "images", ROOT / "docs" / "results"
+sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests" / "support")]  # `paper`; the bench of the presses
+FILMS = {"grasp": 8, "rotate": 20, "rotate_without_orientation": 20, "rotate_clear": 10}  # s of each episode
+
+
+def animation() -> None:
+    """hand.gif."""
+    import hand
+
+    hand.main()
+
+
+def films() -> None:
+    """A film of each shipped policy."""
+    for name, seconds in FILMS.items():
+        print(f"film of {name}", flush=True)
+        options = ["--episodes", "64", "--no-baseline", "--seconds", f"{seconds}"]
+        evaluate.main([name, *options, "--video", str(IMAGES / f"{name}.mp4")])
+
+
+def view() -> None:
+    """view.png: the page of recorded episodes, in a headless Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    episodes = str(ROOT / "assets" / "episodes" / "grasp.npz")
+    page_server = subprocess.Popen([sys.executable, "-m", "dexsim.view", episodes, "--port", "8093"])
+    try:
+        time.sleep(8)
+        with sync_playwright() as chromium:
+            options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+            browser = chromium.chromium.launch(executable_path="/usr/bin/chromium", args=options)
+            page = browser.new_page(viewport={"width": 1280, "height": 900})
+            page.set_default_timeout(300_000)
+            page.goto("http://127.0.0.1:8093")
+            time.sleep(20)
+            page.get_by_role("checkbox").first.click()  # Paused: without a GPU a moving page is never drawn whole.
+            for close in page.locator(".mantine-Notification-closeButton").all():
+                close.click()
+            time.sleep(10)
+            page.screenshot(path=str(IMAGES / "view.png"))
+            browser.close()
+    finally:
+        page_server.terminate()
+        page_server.wait()
+
+
+def tables() -> None:
+    """The figures of the paper's tables."""
+    from paper.command import reports_of
+    from paper.experiments import EXPERIMENTS
+
+    for experiment in EXPERIMENTS.values():
+        reports = reports_of(experiment, RESULTS)
+        if experiment.draw and reports:
+            experiment.draw(experiment, reports, RESULTS / experiment.name)
+
+
+def robustness() -> None:
+    """Rotation over one parameter at a time: measured points, training's range, and the value within it."""
+    from paper import figures
+    from paper.command import reports_of
+    from paper.experiments import EXPERIMENTS
+
+    experiment = EXPERIMENTS["robustness"]
+    reports = reports_of(experiment, RESULTS)
+    rows = [row for row in experiment.rows if row.skill == "rotate" and row.points and row.name in reports]
+    if not rows:
+        print("robustness: no reports of the shipped rotation; python benchmarks/paper.py robustness makes them")
+        return
+    figure, axes = figures._subplots(-(-len(rows) // 5), 5, 2.3, 2.1)
+    for axis in axes.ravel()[len(rows) :]:
+        axis.axis("off")
+    reference = next(_points(reports["rotate_reference"]))
+    for axis, row in zip(axes.ravel(), rows, strict=False):
+        points = np.array(list(_points(reports[row.name])))
+        off = np.abs(points[:, 2:].T - points[:, 1])
+        axis.errorbar(
+            points[:, 0], points[:, 1], off, fmt="o", ms=3, capsize=2, color=figures.COLORS[0], label="measured"
+        )
+        axis.axhline(reference[1], ls=":", color="0.5", lw=1, label="within all training ranges")
+        axis.axhspan(reference[2], reference[3], color="0.5", alpha=0.12, lw=0)
+        axis.set_xlabel(row.label.partition(": ")[2], fontsize=8)
+        axis.tick_params(labelsize=7)
+        axis.set_ylim(0, None)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("quarter turns a minute", fontsize=8)
+    axes[0, 0].legend(fontsize=6, frameon=False, loc="lower left")
+    figures._save(figure, RESULTS / "figures" / "robustness_rotate.svg")
+
+
+def _points(report: dict[str, Any]) -> Iterator[tuple[float, float, float, float]]:
+    """Value of the parameter, quarter turns a minute, and their interval."""
+    for point in (point for seed in report["seeds"].values() for point in seed["points"]):
+        pace, value = point["successes_per_minute"], point["point"]
+        yield np.nan if value is None else value, pace["mean"], pace["low"], pace["high"]
+
+
+def skin() -> None:
+    """Stress over compression: the law, taxels under a flat face, and named silicones."""
+    from paper import figures
+
+    from dexsim.geometry import sdf
+    from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+    from dexsim.touch.skin import MATERIALS, Skin, skin_of, skin_stress
+    from dexsim.touch.taxel_force import compute_touch
+
+    hand, law = dexsim.load_hand(), Skin()
+    pose = forward_kinematics(hand, jnp.zeros(hand.num_joints))
+    taxels = np.asarray(taxel_positions(hand, pose))
+    face = sdf.Shape(("box",), jnp.full((1, 3), 0.1), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
+    foremost, measured = int(np.argmax(taxels[1, :, 0])), []
+    for depth in np.linspace(0.0001, 0.69, 24) * law.thickness:
+        # The face's plane is `depth` into the rubber over the foremost taxel of the index finger.
+        height = taxels[1, :, 0].max() + law.margin - depth + 0.1
+        place = jnp.array([height, *taxels[1, :, 1:].mean(0)], jnp.float32)
+        touch = compute_touch(hand, pose, face, place, jnp.eye(3), jnp.ones(hand.num_fingers), law)
+        stress = touch.skin_force[1, foremost] / np.broadcast_to(hand.taxel_area, taxels.shape[:2])[1, foremost]
+        measured.append((touch.depth[1, foremost] / law.thickness, stress))
+    strain = np.linspace(0.0, law.max_compression, 36)
+    figure, axes = figures._subplots(1, 2, 4.2, 3.2)
+    left, right = axes[0]
+    left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, law)), color=figures.COLORS[0], label="Mooney–Rivlin")
+    linear = dataclasses.replace(law, law="linear")
+    left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, linear)), "--", color="0.5", label="linear")
+    points = np.array(measured) * [100, 1e-3]
+    left.plot(points[:, 0], points[:, 1], "o", ms=3, color=figures.COLORS[1], label="taxel under a flat face")
+    for color, name in zip(figures.COLORS, MATERIALS, strict=False):
+        stress = 1e-3 * np.asarray(skin_stress(strain, skin_of(name)))
+        right.plot(100 * strain[1:], stress[1:], color=color, label=name.replace("_", " "))
+    right.set_yscale("log")
+    for axis, title in ((left, "the hand's skin"), (right, "silicones")):
+        axis.set(xlabel="compression [%]", ylabel="stress [kPa]", title=title)
+        axis.legend(fontsize=7, frameon=False)
+    figures._save(figure, RESULTS / "figures" / "stress_strain.svg")
+
+
+def calibration() -> None:
+    """Currents and torques of the index finger's presses on the emulated hand."""
+    from calibrating import operator
+    from press_plant import PressBench
+
+    from dexsim.calibration.maps import load_calibration
+    from dexsim_real.calibrate.__main__ import fit_and_report, record
+    from dexsim_real.calibrate.options import CalibrateArguments
+    from dexsim_real.calibrate.press_fit import torque_constants
+    from dexsim_real.twin.virtual import VirtualPort
+
+    hand = dexsim.load_hand()
+    with tempfile.TemporaryDirectory() as folder:
+        bench = PressBench(hand, 0, kind="inside")
+        port = VirtualPort(bench)
+        options = CalibrateArguments(
+            port="bench",
+            output=Path(folder) / "hand.toml",
+            log=Path(folder) / "press.log",
+            plot=RESULTS / "figures" / "calibration.svg",
+            yes=True,
+            realtime=False,
+            fingers=("index",),
+            sides=False,
+        )
+        log = record(options, hand, operator(), port=port, clock=port.clock, sleep=port.sleep)
+        fit_and_report(options, hand, [log], operator())
+        constants = np.abs(torque_constants(load_calibration(options.output, hand)).mean(0))
+    truth = bench.truth()
+    for name in ("index_joint1", "index_joint2"):
+        joint = hand.joint_names.index(name)
+        true = np.mean([truth[f"{way}_nm_per_a"][joint] for way in ("loading", "unloading")])
+        print(f"{name}: torque constant off by {constants[joint] / true - 1:+.1%}")
+
+
+def objects() -> None:
+    """objects.jpg: each object that no training has seen, in the hand after 6 s of the middle command."""
+    from paper.held_out import NAMES, HeldOutGrasp
+    from paper.measure import HELD_OUT_POOL
+    from PIL import Image, ImageDraw
+
+    from dexsim.env.env import Env
+
+    policy, hand = load_policy("grasp"), dexsim.load_hand()
+    config = from_dict(dexsim.GraspConfig, override(policy.env_config, [f"pool_size={HELD_OUT_POOL}"]))
+    env = Env(HeldOutGrasp(config, hand, NAMES), hand, backend="auto")
+    evaluation = dexsim.Evaluation(env)
+    plan = evaluation.evaluation_plan(5 * len(NAMES), 0)
+    chosen = 5 * np.arange(len(NAMES)) + 2
+    state = evaluation.evaluation_starts(jax.tree.map(lambda x: x[chosen], plan))
+    step, carry = jax.jit(jax.vmap(env.step)), policy.initial_carry(len(NAMES))
+    for _ in range(round(6.0 / env.control_period)):
+        carry, action = policy.act(carry, state.obs["actor"])
+        state = step(state, action)
+    shots = jax.device_get(jax.vmap(evaluation.snapshot)(state))
+    width, height, columns = 252, 240, 6
+    sheet = Image.new("RGB", (columns * width, -(-len(NAMES) // columns) * height), "white")
+    for k, name in enumerate(NAMES):
+        shot = jax.tree.map(lambda x, k=k: x[k], shots)
+        picture = render_frame(hand, env.task.slots, shot, size=(width + height // 2, height))[:, :width]
+        tile = Image.fromarray(np.ascontiguousarray(picture))
+        ImageDraw.Draw(tile).text((8, 6), name.replace("_", " "), fill="white")
+        sheet.paste(tile, (k % columns * width, k // columns * height))
+    buffer = io.BytesIO()
+    sheet.save(buffer, "JPEG", quality=82)
+    (RESULTS / "figures" / "objects.jpg").write_bytes(buffer.getvalue())
+
+
+MAKERS = {maker.__name__: maker for maker in (tables, robustness, skin, calibration, objects, view, animation, films)}
+
+
+def main() -> None:
+    cli.enable_caches()
+    for name in sys.argv[1:] or MAKERS:
+        print(f"figures: {name}", flush=True)
+        MAKERS[name]()
+
+
+if __name__ == "__main__":
+    main()
