@@ -44,9 +44,11 @@ class HandSheet:
     motors: tuple[str, ...]  # joints in the TOML's order
     taxel_grid: tuple[int, int]
     taxel_pitch: tuple[float, float]
-    posture: dict[str, float]
-    centre: np.ndarray
     remarks: tuple[str, ...]  # lines of a comment: sources, assumptions, signs
+    # Of the first grasp.
+    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
+    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
+    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
 
 
 def write_hand(sheet: HandSheet, folder: Path) -> Path:
@@ -135,6 +137,7 @@ def _toml(sheet: HandSheet) -> str:
         "\n[grasp]",
         f"posture = {_row(angles)}",
         f"centre = {_row(sheet.centre)}",
+        f"finger_force = {_row(sheet.finger_force)}",
     ]
     for finger in sheet.fingers:
         lines += [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from dexsim.hand.description import Hand
+from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.render.camera import look
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
@@ -46,7 +46,7 @@ class Scene:
         for number, geom in enumerate(hand.geoms):
             if geom.kind != "plane":
                 tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
-                mesh = primitive(geom.kind, geom.size)
+                mesh = primitive_mesh(geom.kind, geom.size)
                 server.scene.add_mesh_simple(
                     f"/hand/{hand.body_names[geom.body]}/{number}",
                     mesh.vertices,
@@ -117,7 +117,7 @@ class Scene:
         for root in ("object", "goal"):
             ghost = root == "goal"
             for k in active:
-                mesh = primitive(frame.kinds[k], snapshot.primitive_size[k])
+                mesh = primitive_mesh(frame.kinds[k], snapshot.primitive_size[k])
                 mesh.apply_scale(0.6 if ghost else 1.0)
                 parts = box_faces(mesh) if frame.kinds[k] == "box" and len(active) == 1 else [(OBJECT, mesh)]
                 for number, (color, part) in enumerate(parts):
@@ -143,20 +143,6 @@ def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
     centre = np.einsum("fn,fnk->fk", taxel_force, pose.taxel_position)[touching] / total[touching, None]
     # The head is at the skin, so that the arrow is outside of the finger.
     return np.stack([centre - _METRES_PER_NEWTON * force, centre], 1)
-
-
-def primitive(kind: str, size: np.ndarray) -> trimesh.Trimesh:
-    """A primitive as a mesh; `size` as in MuJoCo, m."""
-    a, b, c = (float(x) for x in size)
-    if kind == "box":
-        return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
-    if kind == "capsule":
-        return trimesh.creation.capsule(radius=a, height=2 * b, count=(24, 16))
-    if kind == "cylinder":
-        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=32)
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    ball.apply_scale((a, b, c) if kind == "ellipsoid" else a)
-    return ball
 
 
 def box_faces(box: trimesh.Trimesh) -> list[tuple[tuple[int, int, int], trimesh.Trimesh]]:
