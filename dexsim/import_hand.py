@@ -281,6 +281,8 @@ def table(sheet: HandSheet, grasp: Grasp) -> list[str]:
     lines.append(
         f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond:.0f} mm beyond it"
     )
+    low, high = sheet.finger_force
+    lines.append(f"force        targets of {low:.1f} to {high:.1f} N a finger: what the thumb can oppose")
     lines.append(
         f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in grasp.centre)} mm, {grasp.reaching} of "
         f"{len(sheet.fingers)} fingertips near it, the farthest {1e3 * grasp.farthest:.0f} mm away"

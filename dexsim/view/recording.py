@@ -6,7 +6,6 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import Episodes
-from dexsim.render.render import CAMERAS
 from dexsim.render.snapshot import Snapshot
 from dexsim.view.source import Control, Frame, Slider, Values
 
@@ -21,8 +20,7 @@ class Recording:
 
     def __init__(self, episodes: Episodes):
         self._episodes, self.hand, self.period = episodes.snapshots, episodes.hand, episodes.period
-        self.camera = episodes.task if episodes.task in CAMERAS else "grasp"
-        self._kinds, self._number, self._tick = episodes.kinds, -1, 0
+        self.task, self._kinds, self._number, self._tick = episodes.task, episodes.kinds, -1, 0
 
     def controls(self) -> dict[str, Control]:
         """The time at which episodes begin."""

@@ -14,7 +14,7 @@ from dexsim.render.camera import look
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
 from dexsim.render.picture import Pose, hand_poses
-from dexsim.render.render import CAMERAS
+from dexsim.render.render import camera_of
 from dexsim.view.source import Frame
 
 _IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing
@@ -26,12 +26,12 @@ _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
 
 
 class Scene:
-    """A hand in the browser: on a server of viser, seen by a preset of `CAMERAS`, which also says where up is."""
+    """A hand in the browser: on a server of viser, seen by the camera of a task, which also says where up is."""
 
-    def __init__(self, server: Any, hand: Hand, camera: str):
+    def __init__(self, server: Any, hand: Hand, task: str):
         self._server, self._hand = server, hand
         self._shape: Any = None  # what the object looked like when it was last sent
-        view = CAMERAS[camera]
+        view = camera_of(task, hand)
         self._up = np.asarray(view.up, float)
         server.scene.set_up_direction(view.up)
         server.scene.configure_default_lights(True, cast_shadow=False)

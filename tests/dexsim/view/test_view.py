@@ -181,7 +181,7 @@ class Page(viewer.Viewer):
             self._read_out_at = 0.0
             self._show(frame)
         touching = sum(frame.snapshot.taxel_force.max() > 0.05 for frame in frames) / len(frames)
-        print(self.source.camera, len(frames), touching > 0.5, "jax" in sys.modules and sys.modules["jax"])
+        print(self.source.task, len(frames), touching > 0.5, "jax" in sys.modules and sys.modules["jax"])
         self.server.stop()
 viewer.Viewer = Page
 for name in {recorded}:
