@@ -37,6 +37,8 @@ _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
 _RUBBER = 0.003  # m, by which the environment enlarges fingertips (`PhysicsConfig.pad_thickness`)
 _GAPS = (0.006, 0.010, 0.015, 0.020)  # m, between ball and links; the first that leaves room for boxes is taken
+_PRESSING = 2.75  # fingers that oppose the thumb at once: gives the XHand's highest target, 4.8 N, of its 13.2 N
+_CARRYING = 1.0  # N, of each of two fingers that carry 0.2 kg, the heaviest of the default objects
 _DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 
@@ -126,10 +128,11 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
 
 def force_targets(hand: Hand) -> tuple[float, float]:
     """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture, shared
-    by the fingers that it opposes, or the weakest finger's; the lowest is a quarter of it, as on the XHand."""
+    by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand, or what
+    carries an object."""
     thumb, *others = fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))
-    highest = float(np.clip(min(thumb / len(others), *others), 0.2, 40.0))
-    return highest / 4, highest
+    highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
+    return min(max(highest / 4, _CARRYING), highest), highest
 
 
 def parse_axis(text: str) -> np.ndarray:

@@ -39,6 +39,7 @@ class Hand:
     joint_upper: np.ndarray  # [J] rad
     torque_limit: np.ndarray  # [J] Nm, stall torque
     speed_limit: np.ndarray  # [J] rad/s, no-load speed
+    gain: np.ndarray  # [J] 1, over the nominal motor gains k_p and k_d
     body_names: tuple[str, ...]
     body_parent: np.ndarray  # [B], -1 for the palm
     body_position: np.ndarray  # [B, 3] m, in the parent's frame

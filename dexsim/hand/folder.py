@@ -17,6 +17,7 @@ from dexsim.hand.fit import Capsule, PalmBox
 from dexsim.hand.vendor import Link
 
 _TOUCH, _SHELL, _PAD = (0.30, 0.32, 0.36, 1.0), (0.25, 0.27, 0.30, 1.0), (0.85, 0.85, 0.87, 1.0)  # colours
+_NOMINAL_TORQUE = 1.1  # Nm, stall torque of the motors that the nominal gains are for
 _COUPLING = {"solref": [0.012, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # stiff
 
 
@@ -132,6 +133,7 @@ def _toml(sheet: HandSheet) -> str:
         f'palm = "{sheet.links[0].name}"',
         "joints = [" + ", ".join(f'"{name}"' for name in sheet.motors) + "]",
         f"speed_limits = {_row(speeds)}",
+        f"gains = {_row(min(joints[name].torque / _NOMINAL_TORQUE, 1.0) for name in sheet.motors)}",
         f"taxel_grid = {list(sheet.taxel_grid)}",
         f"taxel_pitch = {_row(sheet.taxel_pitch)}",
         "\n[grasp]",

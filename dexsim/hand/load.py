@@ -68,6 +68,9 @@ class HandFile(Config):
     """Its body."""
     joints: tuple[str, ...]
     speed_limits: tuple[float, ...] = setting(unit="rad/s", low=1e-3, high=1000.0)
+    gains: tuple[float, ...] = setting((), unit="1", low=1e-3, high=10.0)
+    """Of each motor, over the nominal gains k_p and k_d (`Randomization`); empty for 1. Weak motors need less: with the
+    nominal gain they are at their torque limit, where force follows no command."""
     taxels: str = ""
     """CSV of the taxels (`dexsim.hand.layout`)."""
     taxel_grid: tuple[int, int] = setting(low=1, high=MOST)
@@ -123,6 +126,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         joint_upper=_f32(model.jnt_range[joints, 1]),
         torque_limit=_f32(model.jnt_actfrcrange[joints, 1]),
         speed_limit=_f32(table.speed_limits),
+        gain=_f32(table.gains or np.ones(len(joints))),
         body_names=tuple(model.body(b).name for b in bodies),
         body_parent=np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies]),
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
@@ -205,8 +209,9 @@ def _find_joints(
             f"{path}: joints lists {len(set(joints))} of the {motors} joints of {model_path.name}; every joint must be "
             "a hinge, and be listed once or follow one by an equality"
         )
-    if len(table.speed_limits) != len(joints):
-        raise AssetError(f"{path}: {len(table.speed_limits)} speed_limits for {len(joints)} joints")
+    for name, values in (("speed_limits", table.speed_limits), ("gains", table.gains or joints)):
+        if len(values) != len(joints):
+            raise AssetError(f"{path}: {len(values)} {name} for {len(joints)} joints")
     for name, joint, (low, high) in zip(table.joints, joints, model.jnt_actfrcrange[joints], strict=True):
         if not model.jnt_limited[joint] or high <= 0 or not np.isclose(low, -high):
             raise AssetError(

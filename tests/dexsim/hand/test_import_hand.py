@@ -1,6 +1,7 @@
 """Hands from makers' files. The stand-ins have the quirks of public ones: a URDF's frames and packages, joints that are
 turned round, a wrist above the palm, followers, tendons, absent meshes and torques."""
 
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -14,6 +15,7 @@ from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.vendor import read_description
+from dexsim.randomization import Randomization, sample_hand
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 
@@ -153,10 +155,14 @@ def test_the_whole_command(tmp_path, capsys):
     hand = load_hand(tmp_path / "out" / "out.toml")
     assert hand.num_joints == 8 and hand.num_hinges == 12
     np.testing.assert_allclose(sorted(set(hand.body_ratio.round(5))), [0.8, 1.0])
-    # A quarter of the highest target is the lowest, and the three fingers at the highest are all the thumb can oppose.
+    # What the thumb can oppose, and gains in proportion to stall torques.
     low, high = Grasp(GraspConfig(), hand).finger_force
     thumb, *others = fingertip_strength(hand, np.float32(hand.grasp_posture))
-    assert low == pytest.approx(high / 4, abs=1e-3) and high == pytest.approx(min(thumb / 3, *others), abs=1e-3)
+    assert low == pytest.approx(max(high / 4, 1.0), abs=1e-3)
+    assert high == pytest.approx(min(thumb / 2.75, *others), abs=1e-3)
+    nominal = sample_hand(jax.random.key(0), Randomization(scale=0), hand, timestep=0.01, control_period=0.03)
+    np.testing.assert_allclose(nominal.actuator.stiffness, 3.0 / 1.1, rtol=1e-3)
+    np.testing.assert_allclose(nominal.actuator.damping, 0.1 / 1.1, rtol=1e-3)
 
 
 def test_an_imported_hand_can_be_mirrored(tmp_path, monkeypatch):
