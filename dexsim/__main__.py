@@ -17,8 +17,8 @@ COMMANDS = {
     "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
     "train": ("dexsim_ppo.train", "train a task"),
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
-    "demo": ("dexsim.view.demo", "show a shipped policy in the browser, without JAX too"),
-    "view": ("dexsim.view.__main__", "show a hand live in the browser"),
+    "demo": ("dexsim.view.__main__", "show a trained hand in the browser, without JAX too"),
+    "view": ("dexsim.view.__main__", "the same, of a policy, task or log of your own"),
     "export": ("dexsim_ppo.export", "write a policy as an ONNX model or a bundle"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
     "run": ("dexsim_real.run.__main__", "run a policy on the hand"),
@@ -26,9 +26,8 @@ COMMANDS = {
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
     "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
-    "mirror-hand": ("dexsim.hand.mirror", "write the mirror image of a hand"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
-    "import-hand": ("dexsim.import_hand", "make a hand's folder from a URDF or MJCF"),
+    "import-hand": ("dexsim.import_hand", "make a hand's folder from a URDF or MJCF, or its mirror image"),
 }
 """Module and purpose of each command."""
 WITHOUT_JAX = ("demo", "view")

@@ -1,6 +1,7 @@
 """Makes a hand's folder from a maker's URDF or MJCF: palm frame, capsules, pads, limits and a first grasp.
 
     python -m dexsim.import_hand maker/hand.urdf --out my_hand
+    python -m dexsim.import_hand my_hand/my_hand.toml --mirror --out my_left
 
 It prints what it found and what it assumed, and checks the result (`dexsim.check_hand`).
 """
@@ -8,6 +9,7 @@ It prints what it found and what it assumed, and checks the result (`dexsim.chec
 import dataclasses
 import re
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +22,14 @@ from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
-from dexsim.hand.anatomy import Anatomy, flexion_links, orient, tip_of
+from dexsim.hand.anatomy import Anatomy, Finger, flexion_links, orient, tip_of
+from dexsim.hand.description import Hand
+from dexsim.hand.files import find_hand
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import FingerSheet, HandSheet, write_hand
+from dexsim.hand.kinematics import fingertip_strength
+from dexsim.hand.load import load_hand
+from dexsim.hand.mirror import swap_sides, write_mirror
 from dexsim.hand.posture import Grasp, find_grasp
 from dexsim.hand.vendor import Joint, Link, read_description
 
@@ -30,6 +37,8 @@ _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
 _RUBBER = 0.003  # m, by which the environment enlarges fingertips (`PhysicsConfig.pad_thickness`)
 _GAPS = (0.006, 0.010, 0.015, 0.020)  # m, between ball and links; the first that leaves room for boxes is taken
+_PRESSING = 2.75  # fingers that oppose the thumb at once: gives the XHand's highest target, 4.8 N, of its 13.2 N
+_CARRYING = 1.0  # N, of each of two fingers that carry 0.2 kg, the heaviest of the default objects
 _DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 
@@ -38,9 +47,12 @@ class ImportArguments(Config):
     """Options of `python -m dexsim.import_hand`."""
 
     file: Annotated[Path, tyro.conf.Positional]
-    """The maker's URDF or MJCF. Meshes may be missing: their links get no capsule, fingertips an assumed one."""
+    """The maker's URDF or MJCF; with --mirror also a hand's TOML, or the name of a shipped one. Meshes may be missing:
+    their links get no capsule, fingertips an assumed one."""
     out: Path
     """Folder to write."""
+    mirror: bool = False
+    """Write the mirror image: a left hand of a right one, or the other way round."""
     name: str = ""
     """The hand's name; empty for the folder's."""
     palm: str = ""
@@ -74,7 +86,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     description = "Make a hand's folder from a maker's URDF or MJCF."
     arguments = cli.parse(ImportArguments, argv, prog="python -m dexsim.import_hand", description=description)
+    path, passed = arguments.file, True
+    with tempfile.TemporaryDirectory() as scratch:
+        if not arguments.mirror or path.suffix in (".urdf", ".xml"):
+            path, passed = _import(arguments, Path(scratch) if arguments.mirror else arguments.out)
+        if arguments.mirror:
+            path = write_mirror(find_hand(path), arguments.out)
+    print(f"wrote {path}" + ("" if passed else ": it does not pass yet; edit it, and see docs/your_own_hand.md"))
+    return 0 if passed else 1
+
+
+def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
+    """Write a maker's hand into a folder: the TOML, and whether it passes its checks."""
     name = arguments.name or re.sub(r"\W", "_", arguments.out.resolve().name)
+    name = swap_sides(name) if arguments.mirror else name
     source = read_description(
         arguments.file,
         palm=arguments.palm,
@@ -87,18 +112,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("\n".join(frame_lines(anatomy)))
     if not arguments.yes:
         _confirm()
-    sheet, lines = make_sheet(anatomy, name, arguments.torque, arguments.speed, arguments.file.name, _GAPS[0])
-    print("\n".join(lines), flush=True)
+    sheet, assumed = make_sheet(anatomy, name, arguments.torque, arguments.speed, arguments.file.name)
     for gap in _GAPS:
-        if gap > _GAPS[0]:
-            sheet, _ = make_sheet(anatomy, name, arguments.torque, arguments.speed, arguments.file.name, gap)
-        path = write_hand(sheet, arguments.out)
+        sheet, grasp = close_hand(sheet, anatomy.fingers, gap)
+        path = write_hand(sheet, folder)
+        sheet = dataclasses.replace(sheet, finger_force=force_targets(load_hand(path)))
+        path = write_hand(sheet, folder)
         checks, passed = report(path)
         if not any("free of overlap" in line for line in checks):
             break
-    print("\n".join(line for line in checks if re.match(r"ok|FAIL|-  ", line)))
-    print(f"wrote {path}" + ("" if passed else ": it does not pass yet; edit it, and see docs/your_own_hand.md"))
-    return 0 if passed else 1
+    lines = [*table(sheet, grasp), *(f"assumed      {text}" for text in assumed)]
+    print("\n".join([*lines, *(line for line in checks if re.match(r"ok|FAIL|-  ", line))]))
+    return path, passed
+
+
+def force_targets(hand: Hand) -> tuple[float, float]:
+    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture, shared
+    by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand, or what
+    carries an object."""
+    thumb, *others = fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))
+    highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
+    return min(max(highest / 4, _CARRYING), highest), highest
 
 
 def parse_axis(text: str) -> np.ndarray:
@@ -156,14 +190,11 @@ def _confirm() -> None:
         raise ConfigError("give --fingers, --normal, --thumb or --palm")
 
 
-def make_sheet(
-    anatomy: Anatomy, name: str, torque: float, speed: float, source: str, gap: float
-) -> tuple[HandSheet, list[str]]:
-    """All that the hand's folder will hold, and a table of it with fits [mm] and assumptions.
+def make_sheet(anatomy: Anatomy, name: str, torque: float, speed: float, source: str) -> tuple[HandSheet, list[str]]:
+    """All that the hand's folder will hold but the grasp, and what was assumed.
 
     Args:
       torque, speed: of all motors, Nm and rad/s; 0 for the file's.
-      gap: m between ball and links in the first grasp.
 
     Raises:
       AssetError: a finger has no motor.
@@ -183,7 +214,6 @@ def make_sheet(
             continue
         capsules[at] = _pad(anatomy, at, assumed) if at in tips else fit_capsule(link.surface, _along(anatomy, at))
     palm = fit_palm(links[0].surface)
-    grasp = find_grasp(anatomy, capsules, palm, gap)
     fingers = _finger_sheets(anatomy)
     order = [at for finger in anatomy.fingers for at in finger.links]
     motors = tuple(dict.fromkeys(j.name for at in order if (j := links[at].joint) and not j.leader))
@@ -203,11 +233,16 @@ def make_sheet(
         motors=motors,
         taxel_grid=(6, 8),
         taxel_pitch=(across, along),
-        posture={motor: grasp.posture[motor] for motor in motors},
-        centre=grasp.centre,
         remarks=(f"Imported from {source} by dexsim import-hand.", frame, signs, *(f"assumed: {a}" for a in assumed)),
     )
-    return sheet, [*_table(sheet, grasp), *(f"assumed      {text}" for text in assumed)]
+    return sheet, assumed
+
+
+def close_hand(sheet: HandSheet, fingers: Sequence[Finger], gap: float) -> tuple[HandSheet, Grasp]:
+    """The sheet with a first grasp, `gap` m between ball and links."""
+    grasp = find_grasp(sheet.links, fingers, sheet.capsules, sheet.palm, gap)
+    posture = {motor: grasp.posture[motor] for motor in sheet.motors}
+    return dataclasses.replace(sheet, posture=posture, centre=grasp.centre), grasp
 
 
 def _finger_sheets(anatomy: Anatomy) -> tuple[FingerSheet, ...]:
@@ -231,7 +266,7 @@ def _finger_sheets(anatomy: Anatomy) -> tuple[FingerSheet, ...]:
     return tuple(sheets)
 
 
-def _table(sheet: HandSheet, grasp: Grasp) -> list[str]:
+def table(sheet: HandSheet, grasp: Grasp) -> list[str]:
     """A line for each link, the palm and the grasp."""
     lines = ["link                    joint                    range [rad]    Nm   rad/s  radius, fit mean, max [mm]"]
     for at, link in enumerate(sheet.links):
@@ -249,6 +284,8 @@ def _table(sheet: HandSheet, grasp: Grasp) -> list[str]:
     lines.append(
         f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond:.0f} mm beyond it"
     )
+    low, high = sheet.finger_force
+    lines.append(f"force        targets of {low:.1f} to {high:.1f} N a finger: what the thumb can oppose")
     lines.append(
         f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in grasp.centre)} mm, {grasp.reaching} of "
         f"{len(sheet.fingers)} fingertips near it, the farthest {1e3 * grasp.farthest:.0f} mm away"
@@ -258,35 +295,30 @@ def _table(sheet: HandSheet, grasp: Grasp) -> list[str]:
 
 def _with_limits(links: tuple[Link, ...], torque: float, speed: float) -> tuple[tuple[Link, ...], list[str]]:
     """The links with plausible limits at all motors, and what was assumed for it."""
-    motors = [link.joint for link in links if link.joint and not link.joint.leader]
-    by_name = {joint.name: joint for joint in motors}
-
-    def plausible(values: list[float], given: float, span: tuple[float, float], unit: str) -> tuple[float, list[str]]:
-        good = [value for value in values if span[0] <= value <= span[1]]
-        best = given or (float(np.median(good)) if good else {"Nm": _TORQUE, "rad/s": _SPEED}[unit])
-        count, option = len(values) - len(good), {"Nm": "torque", "rad/s": "speed"}[unit]
-        if given or not count:
-            return best, []
-        odd = sorted({f"{value:g}" for value in values if value and not span[0] <= value <= span[1]})
-        said = f"says {', '.join(odd)}" if odd else "says nothing"
-        return best, [f"{option} {best:g} {unit} at {count} motors: the file {said}; --{option} gives it"]
-
-    stall, assumed = plausible([joint.torque for joint in motors], torque, TORQUES, "Nm")
-    free, more = plausible([joint.speed for joint in motors], speed, SPEEDS, "rad/s")
+    motors = {link.joint.name: link.joint for link in links if link.joint and not link.joint.leader}
+    limits: dict[str, dict[str, float]] = {}
+    assumed = []
+    for what, given, (low, high), usual, unit in (
+        ("torque", torque, TORQUES, _TORQUE, "Nm"),
+        ("speed", speed, SPEEDS, _SPEED, "rad/s"),
+    ):
+        said = {name: getattr(joint, what) for name, joint in motors.items()}
+        odd = {name: value for name, value in said.items() if not low <= value <= high}
+        good = [value for name, value in said.items() if name not in odd]
+        best = given or (float(np.median(good)) if good else usual)
+        limits[what] = said | dict.fromkeys(said if given else odd, best)
+        if odd and not given:
+            wrong = ", ".join(sorted({f"{value:g}" for value in odd.values() if value})) or "nothing"
+            assumed.append(f"{what} {best:g} {unit} at {len(odd)} motors: the file says {wrong}; --{what} gives it")
 
     def limited(joint: Joint) -> Joint:
         if joint.leader:
             # Where its motor takes it.
-            ends = joint.offset + joint.ratio * np.array([by_name[joint.leader].low, by_name[joint.leader].high])
+            ends = joint.offset + joint.ratio * np.array([motors[joint.leader].low, motors[joint.leader].high])
             return dataclasses.replace(joint, low=float(ends.min()), high=float(ends.max()))
-        good_torque = not torque and TORQUES[0] <= joint.torque <= TORQUES[1]
-        good_speed = not speed and SPEEDS[0] <= joint.speed <= SPEEDS[1]
-        return dataclasses.replace(
-            joint, torque=joint.torque if good_torque else stall, speed=joint.speed if good_speed else free
-        )
+        return dataclasses.replace(joint, torque=limits["torque"][joint.name], speed=limits["speed"][joint.name])
 
-    limited_links = (dataclasses.replace(link, joint=limited(link.joint)) if link.joint else link for link in links)
-    return tuple(limited_links), assumed + more
+    return tuple(dataclasses.replace(link, joint=link.joint and limited(link.joint)) for link in links), assumed
 
 
 def _with_masses(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], list[str]]:

@@ -143,9 +143,10 @@ def sample_hand(
     drawn = _draw(key, config, hand, config.scale * scale)
     values, joints = {name: row[: hand.num_joints] for name, row in drawn.items()}, (hand.num_joints,)
     keys, limit, (low, high) = jax.random.split(key, 20), jnp.asarray(hand.torque_limit), config.ripple_count
+    gain = jnp.asarray(hand.gain)
     actuator = Actuator(
-        stiffness=config.stiffness * values["stiffness_factor"],
-        damping=config.damping * values["damping_factor"],
+        stiffness=config.stiffness * gain * values["stiffness_factor"],
+        damping=config.damping * gain * values["damping_factor"],
         dead_band=values["dead_band"],
         stall_torque=limit * values["torque_factor"],
         no_load_speed=jnp.asarray(hand.speed_limit) * values["speed_factor"],

@@ -94,7 +94,7 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
 
     def largest(step: float) -> tuple[float, int]:
         """The largest eigenvalue, and the joint that moves most in it."""
-        load = np.diag(np.full(hand.num_joints, step**2 * stiffness)) + 2 * step * damping
+        load = np.diag(step**2 * stiffness * hand.gain) + 2 * step * damping
         values, vectors = np.linalg.eig(np.linalg.solve(mass, load))
         worst = int(np.argmax(values.real))
         return float(values.real[worst]), int(np.argmax(np.abs(vectors[:, worst])))

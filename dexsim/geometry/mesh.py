@@ -257,7 +257,10 @@ def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: floa
 def _hull(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
-    hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
+    # Nearly coplanar corners would leave slits between a hull's triangles.
+    grid = 1e-4 * np.ptp(vertices[faces.ravel()], axis=0).max()
+    corners = np.unique(np.round(vertices[faces.ravel()] / grid), axis=0) * grid
+    hull = trimesh.convex.convex_hull(corners)
     return np.asarray(hull.vertices), np.asarray(hull.faces)
 
 

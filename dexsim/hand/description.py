@@ -6,8 +6,12 @@ finger. Poses are in the palm frame (fingers +z, palm normal +x, thumb side +y; 
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+SHAPES = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box"}
+"""Primitives by MuJoCo's number of them; a plane is none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Hand:
     joint_upper: np.ndarray  # [J] rad
     torque_limit: np.ndarray  # [J] Nm, stall torque
     speed_limit: np.ndarray  # [J] rad/s, no-load speed
+    gain: np.ndarray  # [J] 1, over the nominal motor gains k_p and k_d
     body_names: tuple[str, ...]
     body_parent: np.ndarray  # [B], -1 for the palm
     body_position: np.ndarray  # [B, 3] m, in the parent's frame
@@ -57,6 +62,7 @@ class Hand:
     geoms: tuple[Geom, ...]
     grasp_posture: tuple[float, ...] = ()  # rad, from which grasps start; empty: not given
     grasp_centre: tuple[float, ...] = ()  # m, where the object of a grasp belongs; empty: not given
+    grasp_force: tuple[float, float] = (1.2, 4.8)  # N, target of a finger at command 0 and 1
     rotate_posture: tuple[float, ...] = ()  # rad, from which rotations start; empty: not given
     rotate_reference: tuple[float, ...] = ()  # m, where the object of a rotation belongs; empty: not given
     side: str = "right"  # or "left"
@@ -85,3 +91,19 @@ class Hand:
     def num_taxels(self) -> int:
         """Taxels of one finger."""
         return self.taxel_position.shape[1]
+
+
+def primitive_mesh(kind: str, size: np.ndarray) -> Any:
+    """A primitive as a `trimesh.Trimesh`; `size` as in MuJoCo, m."""
+    import trimesh
+
+    a, b, c = (float(x) for x in size)
+    if kind == "box":
+        return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
+    if kind == "capsule":
+        capsule = trimesh.creation.capsule(radius=a, height=2 * b, count=(48, 32))
+        return capsule.apply_translation(-capsule.bounds.mean(0))
+    if kind == "cylinder":
+        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=64)
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    return ball.apply_scale((a, b, c) if kind == "ellipsoid" else a)

@@ -17,6 +17,7 @@ from dexsim.hand.fit import Capsule, PalmBox
 from dexsim.hand.vendor import Link
 
 _TOUCH, _SHELL, _PAD = (0.30, 0.32, 0.36, 1.0), (0.25, 0.27, 0.30, 1.0), (0.85, 0.85, 0.87, 1.0)  # colours
+_NOMINAL_TORQUE = 1.1  # Nm, stall torque of the motors that the nominal gains are for
 _COUPLING = {"solref": [0.012, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # stiff
 
 
@@ -44,9 +45,11 @@ class HandSheet:
     motors: tuple[str, ...]  # joints in the TOML's order
     taxel_grid: tuple[int, int]
     taxel_pitch: tuple[float, float]
-    posture: dict[str, float]
-    centre: np.ndarray
     remarks: tuple[str, ...]  # lines of a comment: sources, assumptions, signs
+    # Of the first grasp.
+    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
+    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
+    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
 
 
 def write_hand(sheet: HandSheet, folder: Path) -> Path:
@@ -130,11 +133,13 @@ def _toml(sheet: HandSheet) -> str:
         f'palm = "{sheet.links[0].name}"',
         "joints = [" + ", ".join(f'"{name}"' for name in sheet.motors) + "]",
         f"speed_limits = {_row(speeds)}",
+        f"gains = {_row(min(joints[name].torque / _NOMINAL_TORQUE, 1.0) for name in sheet.motors)}",
         f"taxel_grid = {list(sheet.taxel_grid)}",
         f"taxel_pitch = {_row(sheet.taxel_pitch)}",
         "\n[grasp]",
         f"posture = {_row(angles)}",
         f"centre = {_row(sheet.centre)}",
+        f"finger_force = {_row(sheet.finger_force)}",
     ]
     for finger in sheet.fingers:
         lines += [

@@ -104,6 +104,22 @@ def _drawn_frames(hand: Hand) -> np.ndarray:
     return frames
 
 
+def fingertip_strength(hand: Hand, joint_position: Array) -> np.ndarray:
+    """Largest force [F] N of each fingertip along its taxels' mean normal that leaves every joint within its stall
+    torque: a static press in one posture, without gravity and friction.
+
+    A force f along the unit vector n at the pad's middle p loads the joints with f (dp/dq)^T n.
+    """
+
+    def pads(joints: Array) -> jax.Array:
+        return taxel_positions(hand, forward_kinematics(hand, joints)).mean(1)
+
+    facing = np.array(taxel_normals(hand, forward_kinematics(hand, joint_position)).mean(1))
+    facing /= np.linalg.norm(facing, axis=-1, keepdims=True)
+    lever = np.abs(np.einsum("fk,fkj->fj", facing, jax.jacfwd(pads)(joint_position)))
+    return (hand.torque_limit / np.maximum(lever, 1e-6)).min(-1)
+
+
 def tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
     """Linear and angular velocity [F, 6] of the finger tips, m/s and rad/s in the palm frame."""
 

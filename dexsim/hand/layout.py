@@ -1,4 +1,4 @@
-"""Taxel layouts for any hand or pad: lattices on primitives and mesh patches, the layout file, and its checks.
+"""Taxel layouts for any hand or pad: lattices on primitives, the layout file, and its checks.
 
     patch = on_surface("cylinder", lattice(10, 12, pitch=0.0022), radius=0.008)
     patch = placed(patch, position=(0, 0, 0.02), rotation=turn)       # in the link's frame
@@ -104,30 +104,6 @@ def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: 
     normal = np.stack([np.cos(polar) * np.cos(angle), np.cos(polar) * np.sin(angle), np.sin(polar)], -1)
     position = radius * normal + np.stack([0 * v, 0 * v, v - over], -1)
     return Patch(points.grid, position, normal, points.cell * np.cos(polar))
-
-
-def on_mesh(mesh: Any, points: Lattice, *, origin: Any, facing: Any, along: Any) -> Patch:
-    """Drop a lattice onto a mesh: from a plane at `origin`, against the direction `facing`, rows running `along`.
-
-    Each taxel is where its ray first meets the mesh, with that triangle's normal, and represents the surface that is
-    under its cell.
-
-    Raises:
-      AssetError: a ray misses the mesh or grazes it (below 10 degrees).
-    """
-    facing, along = _unit(np.asarray(facing, float)), np.asarray(along, float)
-    along = _unit(along - (along @ facing) * facing)
-    start = np.asarray(origin, float) + points.u[:, None] * np.cross(along, facing) + points.v[:, None] * along
-    position, face = _first_hit(mesh.corners, start, -facing)
-    normal = mesh.normals[face]
-    cosine = np.where(face < 0, 0.0, normal @ facing)
-    if np.any(cosine < np.sin(np.radians(10))):
-        column, row = divmod(int(cosine.argmin()), points.grid[1])
-        raise AssetError(
-            f"{mesh.name}: the ray of taxel column {column}, row {row} misses the mesh or grazes it; make the lattice "
-            "smaller, move its origin or turn `facing`"
-        )
-    return Patch(points.grid, position, normal, points.cell / cosine)
 
 
 def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> Patch:
@@ -241,28 +217,3 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
             f"{path}: finger {fingers[worst]!r} has {count[worst]} valid taxels, expected {columns * rows}"
         )
     return table.reshape(len(fingers), -1, 7)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
-
-
-def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does
-    (Moeller and Trumbore 1997)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    ab, ac = b - a, c - a
-    across = np.cross(ray, ac)
-    volume = np.einsum("td,td->t", ab, across)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        arm = start[:, None] - a
-        u = np.einsum("ntd,td->nt", arm, across) / volume
-        over = np.cross(arm, ab)
-        v = over @ ray / volume
-        along = np.einsum("ntd,td->nt", over, ac) / volume
-        hit = (np.abs(volume) > 1e-18) & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (along > 0)
-    along = np.where(hit, along, np.inf)
-    face = along.argmin(1)
-    reach = along[np.arange(len(start)), face]
-    hits = np.isfinite(reach)
-    return start + np.where(hits, reach, 0.0)[:, None] * ray, np.where(hits, face, -1)

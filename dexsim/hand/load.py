@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.config import Config, from_dict, setting
+from dexsim.core.config import Config, Range, from_dict, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
-from dexsim.hand.description import Geom, Hand
+from dexsim.hand.description import SHAPES, Geom, Hand
 from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.layout import MOST, lattice, on_surface, placed, read_taxels
 
@@ -41,6 +41,9 @@ class GraspEntry(Config):
     posture: tuple[float, ...] = setting((), unit="rad")
     centre: tuple[float, float, float] | None = None
     """Of the object, m."""
+    finger_force: Range = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
+    """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose. The default is the
+    XHand's."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,6 +68,9 @@ class HandFile(Config):
     """Its body."""
     joints: tuple[str, ...]
     speed_limits: tuple[float, ...] = setting(unit="rad/s", low=1e-3, high=1000.0)
+    gains: tuple[float, ...] = setting((), unit="1", low=1e-3, high=10.0)
+    """Of each motor, over the nominal gains k_p and k_d (`Randomization`); empty for 1. Weak motors need less: with the
+    nominal gain they are at their torque limit, where force follows no command."""
     taxels: str = ""
     """CSV of the taxels (`dexsim.hand.layout`)."""
     taxel_grid: tuple[int, int] = setting(low=1, high=MOST)
@@ -90,7 +96,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
     _check_posture(path, model, joints, table, "grasp")
     _check_posture(path, model, joints, table, "rotate")
     palm = _find(path, model_path, model, "body", table.palm)
-    bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
+    bodies = [b for b in range(1, model.nbody) if is_below(model.body_parentid, b, palm)]
     if unnamed := [b for b in bodies if not model.body(b).name]:
         parent = model.body(model.body_parentid[unnamed[0]]).name
         raise AssetError(f"{model_path}: a body of {parent!r} has no name: every link from the palm on needs one")
@@ -120,6 +126,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         joint_upper=_f32(model.jnt_range[joints, 1]),
         torque_limit=_f32(model.jnt_actfrcrange[joints, 1]),
         speed_limit=_f32(table.speed_limits),
+        gain=_f32(table.gains or np.ones(len(joints))),
         body_names=tuple(model.body(b).name for b in bodies),
         body_parent=np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies]),
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
@@ -142,6 +149,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         geoms=geoms,
         grasp_posture=table.grasp.posture,
         grasp_centre=table.grasp.centre or (),
+        grasp_force=table.grasp.finger_force,
         rotate_posture=table.rotate.posture,
         rotate_reference=table.rotate.reference or (),
         side=table.side,
@@ -201,8 +209,9 @@ def _find_joints(
             f"{path}: joints lists {len(set(joints))} of the {motors} joints of {model_path.name}; every joint must be "
             "a hinge, and be listed once or follow one by an equality"
         )
-    if len(table.speed_limits) != len(joints):
-        raise AssetError(f"{path}: {len(table.speed_limits)} speed_limits for {len(joints)} joints")
+    for name, values in (("speed_limits", table.speed_limits), ("gains", table.gains or joints)):
+        if len(values) != len(joints):
+            raise AssetError(f"{path}: {len(values)} {name} for {len(joints)} joints")
     for name, joint, (low, high) in zip(table.joints, joints, model.jnt_actfrcrange[joints], strict=True):
         if not model.jnt_limited[joint] or high <= 0 or not np.isclose(low, -high):
             raise AssetError(
@@ -212,33 +221,50 @@ def _find_joints(
     return joints, followers
 
 
-def _read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple[int, float, float]]:
-    """Hinges that follow a motor (one motor, two joints): for each its motor's joint, the ratio and the offset [rad].
+def read_coupling(path: Path, model: Any, index: int) -> tuple[int, int, float, float] | None:
+    """An equality of two joints: the one that follows, its leader, the ratio and the offset [rad]; None of others.
 
-    The MJCF says so by an `<equality>` of joints, which the physics honours too. MuJoCo's polynomial is
-    q1 - ref1 = a0 + a1 (q2 - ref2) + ...
+    MuJoCo's polynomial is q1 - ref1 = a0 + a1 (q2 - ref2) + ...
+
+    Raises:
+      AssetError: it has higher powers.
     """
     import mujoco
 
+    first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
+    if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[index]:
+        return None
+    a0, ratio, *higher = model.eq_data[index, :5]
+    if any(higher) or not ratio:
+        raise AssetError(
+            f"{path}: joint {model.joint(first).name!r} follows {model.joint(second).name!r} by the polycoef "
+            f"{model.eq_data[index, :5].tolist()}; only an offset and a ratio are supported: a0 a1 0 0 0"
+        )
+    reference = model.qpos0[model.jnt_qposadr[[first, second]]]
+    return first, second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
+
+
+def _read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple[int, float, float]]:
+    """Hinges that follow a motor (one motor, two joints): for each its motor's joint, the ratio and the offset [rad].
+
+    The MJCF says so by an `<equality>` of joints, which the physics honours too.
+    """
     if model.ntendon:
         raise AssetError(f"{path}: tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
     followers: dict[int, tuple[int, float, float]] = {}
     for index in range(model.neq):
-        first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
         what = f"{path}: equality {model.equality(index).name or f'#{index}'!r}"
-        if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[index]:
+        coupling = read_coupling(path, model, index)
+        if coupling is None:
             raise AssetError(f"{what}: only active ones of two joints are supported")
-        a0, ratio, *higher = model.eq_data[index, :5]
-        if any(higher) or not ratio:
-            raise AssetError(f"{what}: polycoef {model.eq_data[index, :5].tolist()} is not of the form a0 a1 0 0 0")
+        first, second, ratio, offset = coupling
         names = [model.joint(joint).name for joint in (first, second)]
         if first in motors or first in followers:
             raise AssetError(f"{what}: joint {names[0]!r} has a motor or follows another joint already")
         if second not in motors:
             raise AssetError(f"{what}: joint {names[0]!r} follows {names[1]!r}, which has no motor (see joints)")
-        reference = model.qpos0[model.jnt_qposadr[[first, second]]]
-        followers[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
-        reach = np.sort(followers[first][1] * model.jnt_range[second] + followers[first][2])
+        followers[first] = second, ratio, offset
+        reach = np.sort(ratio * model.jnt_range[second] + offset)
         low, high = model.jnt_range[first]
         if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
             raise AssetError(
@@ -275,7 +301,7 @@ def _find_tips(path: Path, model_path: Path, model: Any, table: HandFile, row: d
         if finger.root_joint not in table.joints:
             raise AssetError(f"{path}: root_joint {finger.root_joint!r} is not among joints")
         root = _find(path, model_path, model, "joint", finger.root_joint)
-        if not _is_below(model.body_parentid, body, int(model.jnt_bodyid[root])):
+        if not is_below(model.body_parentid, body, int(model.jnt_bodyid[root])):
             raise AssetError(f"{path}: root_joint {finger.root_joint!r} does not move the tip {finger.tip!r}")
         tips.append(tip)
     return tips
@@ -338,16 +364,15 @@ def _matrix(quat: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def _is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
-    while body > 0:
-        if body == ancestor:
-            return True
+def is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
+    """Whether a body [B] of MuJoCo's is another one or below it."""
+    while body > 0 and body != ancestor:
         body = int(parent[body])
-    return False
+    return body == ancestor
 
 
 def _read_geoms(path: Path, model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
-    names = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 0: "plane"}
+    names = SHAPES | {0: "plane"}
     geoms = []
     for g in range(model.ngeom):
         kind, touches = names.get(int(model.geom_type[g])), bool(model.geom_contype[g] | model.geom_conaffinity[g])

@@ -1,6 +1,6 @@
 """The mirror image of a hand: a right one becomes a left one, and the other way round.
 
-    dexsim mirror-hand my_right.toml --out my_left
+    dexsim import-hand my_right.toml --mirror --out my_left
 
 The palm's frame and every link's are reflected in their planes y = 0. Joint axes are axial vectors: the same angle
 turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
@@ -13,21 +13,18 @@ import io
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, TypeVar, cast
+from typing import TypeVar, cast
 from xml.etree import ElementTree
 
 import numpy as np
-import tyro
 
-from dexsim.core import cli
 from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
 from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR
 from dexsim.hand.description import Hand
-from dexsim.hand.files import find_hand
 from dexsim.hand.load import load_hand
 
 OTHER = {"right": "left", "left": "right"}
@@ -188,7 +185,7 @@ def write_mirror(path: Path, folder: Path) -> Path:
     _paste_includes(model, hand.model_path.parent, hand.model_path.parent)
     files = dict(_gather_files(model, hand.model_path.parent))
     mirror_mjcf(model)
-    comment = f" Mirror image of {hand.model_path.name} in the plane y = 0, by `dexsim mirror-hand`. "
+    comment = f" Mirror image of {hand.model_path.name} in the plane y = 0. "
     model.insert(0, ElementTree.Comment(comment))
     ElementTree.indent(model)
     folder.mkdir(parents=True, exist_ok=True)
@@ -235,25 +232,3 @@ def _gather_files(model: ElementTree.Element, folder: Path) -> Iterator[tuple[st
         name = "_".join(part for part in Path(file).parts if part not in ("..", "/"))
         element.set("file", name)
         yield name, folder / place / file
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MirrorHandArguments:
-    """Options of `dexsim mirror-hand`."""
-
-    hand: Annotated[Path, tyro.conf.Positional]
-    """The TOML of a hand, or the name of a shipped one."""
-    out: Path
-    """Folder for the files of the mirror image."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code, 0."""
-    description = "Write the mirror image of a hand: a left one of a right one, or the other way round."
-    arguments = cli.parse(MirrorHandArguments, argv, prog="dexsim mirror-hand", description=description)
-    print(write_mirror(find_hand(arguments.hand), arguments.out))
-    return 0
-
-
-if __name__ == "__main__":
-    cli.run(main)

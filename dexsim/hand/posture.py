@@ -5,12 +5,12 @@ Shapes: N postures tried at once, L links, C capsules of a chain. Units: m, rad,
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dexsim.hand.anatomy import Anatomy, flexion_links
+from dexsim.hand.anatomy import Finger, flexion_links
 from dexsim.hand.fit import Capsule, PalmBox, segment_distance
 from dexsim.hand.vendor import Link
 
@@ -33,13 +33,15 @@ class Grasp:
     farthest: float  # m, of a tip from the ball's surface
 
 
-def find_grasp(anatomy: Anatomy, capsules: Mapping[int, Capsule], palm: PalmBox, gap: float) -> Grasp:
+def find_grasp(
+    links: tuple[Link, ...], fingers: Sequence[Finger], capsules: Mapping[int, Capsule], palm: PalmBox, gap: float
+) -> Grasp:
     """Close the hand round a ball that lies at the palm, `gap` m away from every link.
 
     The ball is tried in places before the palm. At each place every finger bends until a link is `gap` away from the
     ball; the thumb takes the posture of a grid that opposes the fingers best.
     """
-    links, thumb, fingers = anatomy.description.links, anatomy.fingers[0], anatomy.fingers[1:]
+    thumb, *fingers = fingers
     paths = [_bend(links, finger.links) for finger in fingers]
     grid = _grid(links, thumb.links)
     shapes = [_capsules_at(links, finger.links, path, capsules) for finger, path in zip(fingers, paths, strict=True)]

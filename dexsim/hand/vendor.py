@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 
 from dexsim.core.errors import AssetError
+from dexsim.hand.description import SHAPES, primitive_mesh
+from dexsim.hand.load import is_below, read_coupling
 
 _LEAST_MASS = 1e-3  # kg, of a link that the file gives none
 _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
@@ -86,10 +88,9 @@ def read_description(
     notes: list[str] = []
     try:
         if root.tag == "robot":
-            spec, shapes = _read_urdf(path, root, notes)
-            speeds = _urdf_speeds(root)
+            spec, speeds = _read_urdf(path, root, notes), _urdf_speeds(root)
         else:
-            spec, shapes, speeds = _read_mjcf(path, notes), None, {}
+            spec, speeds = _read_mjcf(path, notes), {}
         tendons = [tendon.name for tendon in spec.tendons]
         if tendons and not drop_tendons:
             raise AssetError(
@@ -103,23 +104,20 @@ def read_description(
         model = spec.compile()
     except ValueError as error:
         raise AssetError(f"{path}: {' '.join(str(error).split())}") from None
-    reader = _Reader(path, model, shapes, notes)
+    reader = _Reader(path, model, notes)
     return reader.read(root.get("name") or root.get("model") or path.stem, root.tag, palm, freeze, couple, speeds)
 
 
-def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, list[Any]]]:
-    """The kinematics as MuJoCo reads them, without shapes, and the shapes of each link in its frame: MuJoCo takes no
-    DAE and GLB, and would not find `package://`."""
-    shapes: dict[str, list[Any]] = {}
+def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoco.MjSpec:
+    """The file as MuJoCo reads it, with meshes that trimesh has read: MuJoCo takes no DAE and GLB, and would not find
+    `package://`."""
+    assets: dict[str, bytes] = {}
     for link in root.iter("link"):
-        parts: list[Any] = []
         for kind in ("visual", "collision"):  # what is drawn is the real shape; the other is often a box round it
+            drawn = kind == "collision" and link.find("visual") is not None
             for element in link.findall(kind):
-                if not parts or kind == "visual":
-                    parts += _urdf_shape(path, element, notes)
-        shapes[link.get("name", "")] = parts
-        for element in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(element)
+                if drawn or not _embed_mesh(path, element, assets, notes):
+                    link.remove(element)
         inertial = link.find("inertial")
         inertia = None if inertial is None else inertial.find("inertia")
         if inertial is not None and (inertia is None or np.any(np.linalg.eigvalsh(_tensor(inertia)) < _NO_INERTIA)):
@@ -131,45 +129,38 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> tuple
     # MuJoCo would fuse the palm with the world.
     compiler.attrib |= {
         "fusestatic": "false",
+        "discardvisual": "false",
         "balanceinertia": "true",
         "boundmass": str(_NO_MASS / 2),
         "boundinertia": "1e-10",
     }
-    return mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode")), shapes
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"), assets=assets)
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
+    for geom in spec.geoms:
+        geom.density, geom.mass = 0.0, 0.0  # masses are the links'
+    return spec
 
 
-def _urdf_shape(path: Path, element: ElementTree.Element, notes: list[str]) -> list[Any]:
-    """A visual or collision element as a mesh in its link's frame; none if its file cannot be read."""
+def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, bytes], notes: list[str]) -> bool:
+    """Put the mesh of a visual or collision element, if it has one, into `assets`; whether the element has a shape."""
     import trimesh
 
-    geometry = element.find("geometry")
-    shape = None if geometry is None or not len(geometry) else geometry[0]
+    shape = element.find("geometry/mesh")
     if shape is None:
-        return []
-    if shape.tag == "mesh":
-        file = _find_file(path, shape.get("filename", ""))
-        try:
-            mesh = trimesh.load(file, force="mesh", process=False)
-        except Exception as error:  # each of trimesh's readers raises its own
-            notes.append(f"mesh {shape.get('filename')}: {' '.join(str(error).split())[:80]}")
-            return []
-        if not len(mesh.faces):
-            return []
-        mesh.apply_scale(_numbers(shape.get("scale"), [1.0, 1.0, 1.0]))
-    elif shape.tag == "box":
-        mesh = trimesh.creation.box(_numbers(shape.get("size"), [0.0] * 3))
-    elif shape.tag == "sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=float(shape.get("radius", 0)))
-    else:
-        mesh = trimesh.creation.cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)))
-    origin = element.find("origin")
-    place = np.eye(4)
-    if origin is not None:
-        # URDF: fixed-axis roll, pitch, yaw.
-        place = trimesh.transformations.euler_matrix(*_numbers(origin.get("rpy"), [0.0] * 3), axes="sxyz")
-        place[:3, 3] = _numbers(origin.get("xyz"), [0.0] * 3)
-    mesh.apply_transform(place)
-    return [mesh]
+        return element.find("geometry/*") is not None
+    name = shape.get("filename", "")
+    try:
+        mesh = trimesh.load(_find_file(path, name), force="mesh", process=False)
+    except Exception as error:  # each of trimesh's readers raises its own
+        notes.append(f"mesh {name}: {' '.join(str(error).split())[:80]}")
+        return False
+    if not len(mesh.faces):
+        return False
+    file = f"{len(assets)}.obj"
+    assets[file] = mesh.export(file_type="obj", include_normals=False, include_texture=False).encode()
+    shape.set("filename", file)
+    return True
 
 
 def _find_file(path: Path, name: str) -> Path:
@@ -194,10 +185,6 @@ def _tensor(inertia: ElementTree.Element) -> np.ndarray:
     return np.array([[float(inertia.get(name, 0)) for name in row] for row in names])
 
 
-def _numbers(text: str | None, default: list[float]) -> list[float]:
-    return [float(x) for x in text.split()] if text else default
-
-
 def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
     """The file without the shapes whose meshes are missing."""
     if path.suffix != ".xml":
@@ -216,8 +203,8 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
 class _Reader:
     """A compiled model on its way to a `Description`."""
 
-    def __init__(self, path: Path, model: mujoco.MjModel, shapes: dict[str, list[Any]] | None, notes: list[str]):
-        self.path, self.model, self.shapes, self.notes = path, model, shapes, notes
+    def __init__(self, path: Path, model: mujoco.MjModel, notes: list[str]):
+        self.path, self.model, self.notes = path, model, notes
         self.data = mujoco.MjData(model)
         hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
         self.data.qpos[model.jnt_qposadr[hinge]] = 0.0
@@ -231,7 +218,7 @@ class _Reader:
         if unknown := set(freeze) - set(names):
             raise AssetError(f"{self.path}: --freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
         at = self._find_palm(palm, {j for j, joint in enumerate(names) if joint in freeze})
-        below = [b for b in range(model.nbody) if b != at and self._is_below(b, at)]
+        below = [b for b in range(model.nbody) if b != at and is_below(model.body_parentid, b, at)]
         joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
         for j in joints:
             if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
@@ -270,11 +257,6 @@ class _Reader:
         kind = {"robot": "URDF", "mujoco": "MJCF"}[tag]
         return Description(name=name, kind=kind, links=tuple(links), frozen=frozen, notes=tuple(self.notes))
 
-    def _is_below(self, body: int, ancestor: int) -> bool:
-        while body and body != ancestor:
-            body = int(self.model.body_parentid[body])
-        return body == ancestor
-
     def _find_palm(self, palm: str, frozen: set[int]) -> int:
         """The body from which all chains of hinges branch off."""
         model = self.model
@@ -287,7 +269,7 @@ class _Reader:
         moving = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
         paths = []
         for body in moving:
-            if not any(other != body and self._is_below(other, body) for other in moving):
+            if not any(other != body and is_below(model.body_parentid, other, body) for other in moving):
                 path = [body]
                 while path[-1]:
                     path.append(int(model.body_parentid[path[-1]]))
@@ -317,22 +299,14 @@ class _Reader:
                 members.append(other)
         turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
         masses = model.body_mass[members]
-        mass, inertia = float(masses.sum()), np.zeros((3, 3))
-        frames = np.zeros((len(members), 9))
-        places = np.zeros((len(members), 3))
-        for i, b in enumerate(members):
-            rotation = data.xmat[b].reshape(3, 3)
-            # MuJoCo puts the centre of a body without mass and shape anywhere.
-            arm = model.body_ipos[b] if masses[i] > _NO_MASS else np.zeros(3)
-            places[i] = turn.T @ (data.xpos[b] + rotation @ arm - origin)
-            matrix = np.zeros(9)
-            mujoco.mju_quat2Mat(matrix, model.body_iquat[b])
-            frames[i] = (turn.T @ rotation @ matrix.reshape(3, 3)).ravel()
+        # MuJoCo puts the centre of a body without mass and shape anywhere.
+        places = np.where((masses > _NO_MASS)[:, None], data.xipos[members], data.xpos[members])
+        places = (places - origin) @ turn
+        mass = float(masses.sum())
         centre = masses @ places / mass if mass > 0 else places[0]
-        for i, b in enumerate(members):  # parallel axes
-            axes, arm = frames[i].reshape(3, 3), places[i] - centre
-            inertia += axes @ np.diag(model.body_inertia[b]) @ axes.T
-            inertia += masses[i] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        axes, arms = turn.T @ data.ximat[members].reshape(-1, 3, 3), places - centre
+        inertia = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia[members], axes)
+        inertia += np.sum(masses * np.sum(arms**2, 1)) * np.eye(3) - (masses * arms.T) @ arms  # parallel axes
         parts = [shape for b in members for shape in self._shapes_of(b)]
         surface = trimesh.util.concatenate(parts) if parts else None
         if surface is not None:
@@ -346,46 +320,24 @@ class _Reader:
 
     def _shapes_of(self, body: int) -> list[Any]:
         """The shapes of a body in the world: its meshes, or else its primitives."""
-        model, data = self.model, self.data
-        if self.shapes is not None:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
-            name = model.body(body).name
-            # A URDF's first link may be the world.
-            first = next(iter(self.shapes)) if body == 0 and name not in self.shapes else name
-            return [shape.copy().apply_transform(pose) for shape in self.shapes.get(first, [])]
+        model = self.model
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
         meshes = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH]
-        shapes = [self._geom(g) for g in meshes or geoms]
-        return [shape for shape in shapes if shape is not None]
+        return [self._geom(g) for g in meshes or geoms if model.geom_type[g] in SHAPES or g in meshes]
 
     def _geom(self, g: int) -> Any:
         import trimesh
 
-        model, kinds = self.model, mujoco.mjtGeom
-        kind, size = model.geom_type[g], model.geom_size[g]
-        if kind == kinds.mjGEOM_MESH:
+        model = self.model
+        if kind := SHAPES.get(model.geom_type[g]):
+            shape = primitive_mesh(kind, model.geom_size[g])
+        else:
             mesh = model.geom_dataid[g]
             vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
             faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
             shape = trimesh.Trimesh(vertices, faces, process=False)
-        elif kind == kinds.mjGEOM_BOX:
-            shape = trimesh.creation.box(2 * size)
-        elif kind == kinds.mjGEOM_CAPSULE:
-            shape = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[16, 16])
-            shape.apply_translation([0, 0, -shape.bounds.mean(0)[2]])
-        elif kind == kinds.mjGEOM_CYLINDER:
-            shape = trimesh.creation.cylinder(size[0], 2 * size[1])
-        elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
-            shape = trimesh.creation.icosphere(subdivisions=2)
-            shape.apply_scale(size if kind == kinds.mjGEOM_ELLIPSOID else np.full(3, size[0]))
-        else:
-            return None
         pose = np.eye(4)
-        mujoco.mju_quat2Mat(frame := np.zeros(9), model.geom_quat[g])
-        rotation = self.data.xmat[model.geom_bodyid[g]].reshape(3, 3)
-        pose[:3, :3] = rotation @ frame.reshape(3, 3)
-        pose[:3, 3] = self.data.xpos[model.geom_bodyid[g]] + rotation @ model.geom_pos[g]
+        pose[:3, :3], pose[:3, 3] = self.data.geom_xmat[g].reshape(3, 3), self.data.geom_xpos[g]
         return shape.apply_transform(pose)
 
     def _torques(self) -> dict[int, float]:
@@ -409,19 +361,11 @@ class _Reader:
         model = self.model
         direct: dict[int, tuple[int, float, float]] = {}
         for e in range(model.neq):
-            first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-            if model.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[e]:
+            coupling = read_coupling(self.path, model, e)
+            if coupling is None:
                 self.notes.append(f"equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints")
-                continue
-            a0, ratio, *higher = model.eq_data[e, :5]
-            if any(higher) or not ratio:
-                polynomial = model.eq_data[e, :5].tolist()
-                raise AssetError(
-                    f"{self.path}: joint {names[first]!r} follows {names[second]!r} by the polynomial {polynomial}; "
-                    f"only an offset and a ratio are supported: change it to a0 a1 0 0 0"
-                )
-            reference = model.qpos0[model.jnt_qposadr[[first, second]]]
-            direct[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
+            else:
+                direct[coupling[0]] = coupling[1:]
         for text in couple:
             follower, _, rest = text.partition("=")
             leader, _, number = rest.partition(":")

@@ -38,21 +38,20 @@ def render_frame(
     camera: Camera | str = "grasp",
     size: tuple[int, int] = (640, 480),
     force_range: float | None = None,
-    finger_range: float | None = None,
 ) -> np.ndarray:
     """One picture, uint8 [H, W, 3]: the scene at the left, the taxel maps in a panel of half the height's width.
 
     Args:
       kinds: the kinds of the object's K primitives.
-      camera: a `Camera` or the name of a preset in `CAMERAS`.
+      camera: a `Camera`, or the name of a task (`camera_of`).
       size: (width, height) in pixels, even, wider than half the height.
       force_range: force of the hottest taxel colour [N]; the snapshot's largest taxel force when left out.
-      finger_range: force of a full bar [N]; the larger of the snapshot's target and largest finger force when left out.
 
     Raises:
       ValueError: a size without room for the scene, or kinds that do not match the snapshot.
     """
     frame = _finite(snapshot)
+    finger_range = float(np.nanmax(np.append(frame.finger_force, frame.target_force)))
     draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
     return draw(frame, hand_poses(hand, frame.joint_position[None])[0])
 
@@ -63,7 +62,6 @@ def render_episode(
     path: str | Path,
     fps: float,
     *,
-    camera: Camera | str | None = None,
     size: tuple[int, int] = (640, 480),
     rate: float | None = None,
 ) -> Path:
@@ -71,7 +69,7 @@ def render_episode(
 
     MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed; a path that ends in .gif
     is always a GIF. `rate` is the video's own number of frames a second, each the nearest snapshot; None shows every
-    snapshot. The camera is the preset named like the task.
+    snapshot.
 
     Raises:
       ValueError: no snapshots, or see `render_frame`.
@@ -85,13 +83,12 @@ def render_episode(
     nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
     snapshots = snapshots.map(lambda x: x[nearest])
     hand = getattr(env, "hand", None) or load_hand()
-    camera = camera_of(env.name, hand) if camera is None else camera
     # One scale for the whole video, so that colours compare across frames; single spikes may saturate.
     loaded = snapshots.taxel_force[snapshots.taxel_force > 0]
     force_range = float(np.quantile(loaded, 0.995)) if loaded.size else None
     targets = snapshots.target_force[np.isfinite(snapshots.target_force)]
     finger_range = max(float(np.quantile(snapshots.finger_force, 0.995)), float(targets.max(initial=0)))
-    draw = _painter(hand, tuple(env.primitive_kinds), snapshots, camera, size, force_range, finger_range or None)
+    draw = _painter(hand, tuple(env.primitive_kinds), snapshots, env.name, size, force_range, finger_range)
     poses = hand_poses(hand, snapshots.joint_position)
 
     def frame(t: int) -> np.ndarray:
@@ -131,10 +128,10 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         raise ValueError(f"size: {width}x{height} must be even, at least 120 high and 0.75 times as wide as high")
     if np.shape(snapshot.primitive_size)[-2] != len(kinds):
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
-    camera = _aimed(CAMERAS[camera], hand) if isinstance(camera, str) else camera
+    camera = camera_of(camera, hand) if isinstance(camera, str) else camera
     layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
-    finger_range = finger_range or float(np.nanmax(np.append(snapshot.finger_force, snapshot.target_force))) or 1.0
+    finger_range = finger_range or 1.0
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
@@ -148,12 +145,8 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
 
 
 def camera_of(task: str, hand: Hand) -> Camera:
-    """The preset of a task, or the grasp's, aimed at this hand."""
-    return _aimed(CAMERAS.get(task, CAMERAS["grasp"]), hand)
-
-
-def _aimed(camera: Camera, hand: Hand) -> Camera:
-    """A preset, moved as far as the grasps of this hand are from those of the shipped one."""
+    """The preset of a task, or the grasp's, moved as far as this hand grasps away from where the shipped one does."""
+    camera = CAMERAS.get(task, CAMERAS["grasp"])
     if not hand.grasp_centre:
         return camera
     moved = np.asarray(camera.target) + np.asarray(hand.grasp_centre) - _GRASP_CENTRE

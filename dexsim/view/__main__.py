@@ -1,18 +1,20 @@
 """Shows a hand live in the browser.
 
-    python -m dexsim.view grasp
+    python -m dexsim.view grasp        # dexsim demo grasp
 
 Shown is a simulation with a policy, the emulated hand (`--emulated`), the log of a run on a hand, or recorded episodes.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from dexsim.core import cli
+from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.install import require
@@ -21,13 +23,13 @@ if TYPE_CHECKING:
     from dexsim.view.source import Source
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewArguments(Config):
     """Options of `python -m dexsim.view`."""
 
-    what: Annotated[str, tyro.conf.Positional]
+    what: Annotated[str, tyro.conf.Positional] = "grasp"
     """Policy file, name of a shipped policy or of a task (my_module:poke for one of your own), log file (.log) of a run
-    on a hand, or episodes (.npz) of `dexsim record`, for which JAX need not be installed."""
+    on a hand, or episodes (.npz) of `dexsim record`. Without JAX a shipped policy is shown by recorded episodes."""
     emulated: bool = False
     """Run the policy on the emulated hand instead of the simulation that it was trained in."""
     hand: str = ""
@@ -49,15 +51,12 @@ def open_source(arguments: ViewArguments) -> "Source":
       DexsimError: see the sources.
     """
     name = arguments.what
-    if name.endswith(".npz"):
+    if name.endswith((".npz", ".log")):
         from dexsim.datasets.episodes import read_episodes
-        from dexsim.view.episodes import RecordedEpisodes
+        from dexsim.view.recording import Recording, read_log
 
-        return RecordedEpisodes(read_episodes(Path(name), arguments.hand))
-    if name.endswith(".log"):
-        from dexsim.view.recording import Recording
-
-        return Recording(Path(name), arguments.hand)
+        read = read_log if name.endswith(".log") else read_episodes
+        return Recording(read(Path(name), arguments.hand))
     if arguments.emulated:
         from dexsim.view.emulation import Emulation
 
@@ -98,6 +97,9 @@ def show(arguments: ViewArguments) -> int:
     Raises:
       DexsimError: it needs JAX, which is missing; see `open_source`.
     """
+    recorded = asset_path("episodes") / f"{arguments.what}.npz"
+    if recorded.is_file() and not find_spec("jax"):
+        arguments = dataclasses.replace(arguments, what=str(recorded))
     if not arguments.what.endswith(".npz"):
         require("jax", "train", f"showing {arguments.what}")
         print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)

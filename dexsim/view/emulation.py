@@ -34,7 +34,7 @@ class Emulation:
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
         self._calibration = ideal_calibration(self.hand)
-        self.period, self.camera, self._seed, self._trial = self._controller.period, policy.task, seed, -1
+        self.period, self.task, self._seed, self._trial = self._controller.period, policy.task, seed, -1
 
     def controls(self) -> dict[str, Control]:
         """The grip command, where the policy takes one."""
@@ -42,7 +42,7 @@ class Emulation:
 
     def reset(self, values: Values) -> Frame:
         self._trial += 1
-        plant = EmulatedHand(self.hand, self.camera, self._seed, trials=1, first=self._trial)
+        plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
         self._run = VirtualRun(plant, self._controller, self._calibration)
         self._ticks: Iterator[None] = self._run.ticking()
         return self.step(values)

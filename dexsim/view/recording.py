@@ -1,72 +1,86 @@
-"""The log of a run on a hand, tick by tick, as the bridge measured it."""
+"""Recorded episodes, tick by tick: of an .npz, or the log of a run on a hand as the bridge measured it."""
 
 from pathlib import Path
 
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim.geometry import rotations
+from dexsim.datasets.episodes import Episodes
 from dexsim.render.snapshot import Snapshot
 from dexsim.view.source import Control, Frame, Slider, Values
-from dexsim_real.replay.replay import replay
+
+_TIME = "go to [s]"
 
 
 class Recording:
-    """A replayed log. The object's shape is not in it: its estimated pose is shown as axes.
+    """Episodes one after another; nothing is simulated. A reset goes to the next one, at the time that the page names.
+
+    Of a log the object's shape is not known: its estimated pose is shown as axes.
+    """
+
+    def __init__(self, episodes: Episodes):
+        self._episodes, self.hand, self.period = episodes.snapshots, episodes.hand, episodes.period
+        self.task, self._kinds, self._number, self._tick = episodes.task, episodes.kinds, -1, 0
+
+    def controls(self) -> dict[str, Control]:
+        """The time at which episodes begin."""
+        longest = max(len(episode.joint_position) for episode in self._episodes)
+        return {_TIME: Slider(0.0, longest * self.period, 0.01, 0.0)}
+
+    def reset(self, values: Values) -> Frame:
+        self._number = (self._number + 1) % len(self._episodes)
+        seconds = self._episodes[self._number].seconds
+        self._tick = min(int(np.searchsorted(seconds, values.get(_TIME, 0.0))), len(seconds) - 1)
+        return self._frame()
+
+    def step(self, values: Values) -> Frame:
+        self._tick += 1
+        if self._tick == len(self._episodes[self._number].joint_position):
+            return self.reset(values)
+        return self._frame()
+
+    def _frame(self) -> Frame:
+        snapshot = self._episodes[self._number].map(lambda x: x[self._tick])
+        note = f"recorded episode {self._number + 1} of {len(self._episodes)}"
+        return Frame(snapshot, self._kinds, note)
+
+
+def read_log(path: Path, hand: str = "") -> Episodes:
+    """A replayed log as one episode.
 
     Raises:
       LogError: not a log, or one that ends before the hand was ready.
       DexsimError: the policy never ran in it.
     """
+    from dexsim.geometry import rotations
+    from dexsim_real.replay.replay import replay
 
-    def __init__(self, path: Path, hand: str = ""):
-        self._run, self._at = replay(path, hand), 0
-        self.hand = self._run.hand
-        if not self._run.ticks:
-            raise DexsimError(f"{path}: the log has no tick of a policy to show")
-        time = self._run.time
-        self.period = float(time[-1] / max(len(time) - 1, 1)) or 0.03
-        self.camera = "rotate" if self._run.report["task"] == "rotate" else "grasp"
-        goals = np.array([tick["readings"]["goal_quat"] for tick in self._run.ticks])
-        changed = np.abs(np.diff(goals, axis=0)).max(-1) > 1e-6
-        self._turns = np.concatenate([[0], np.cumsum(changed)]) if changed.any() else None
-
-    def controls(self) -> dict[str, Control]:
-        """The time in the log, to go to."""
-        return {"go to [s]": Slider(0.0, float(self._run.time[-1]), 0.01, 0.0)}
-
-    def reset(self, values: Values) -> Frame:
-        """Go to the time that the page names."""
-        self._at = int(np.searchsorted(self._run.time, values["go to [s]"]))
-        return self._frame()
-
-    def step(self, values: Values) -> Frame:
-        self._at += 1
-        if self._at >= len(self._run.ticks):
-            return self.reset(values)
-        return self._frame()
-
-    def _frame(self) -> Frame:
-        self._at = min(self._at, len(self._run.ticks) - 1)
-        measured, readings = self._run.measured[self._at], self._run.ticks[self._at]["readings"]
-        return Frame(
-            Snapshot(
-                joint_position=measured.joint_position,
-                object_position=np.asarray(readings["object_position"]),
-                object_rotation=np.asarray(rotations.quat_to_matrix(readings["object_quat"])),
-                primitive_size=np.zeros((0, 3)),
-                primitive_position=np.zeros((0, 3)),
-                primitive_rotation=np.zeros((0, 3, 3)),
-                primitive_active=np.zeros(0, bool),
-                taxel_force=measured.taxel_force,
-                command=np.asarray(readings["command"]),
-                target_force=np.float32(np.nan),
-                finger_force=measured.finger_force,
-                goal_rotation=None
-                if self._turns is None
-                else np.asarray(rotations.quat_to_matrix(readings["goal_quat"])),
-                turns=None if self._turns is None else self._turns[self._at],
-                seconds=self._run.time[self._at],
-            ),
-            (),
-        )
+    run = replay(path, hand)
+    if not run.ticks:
+        raise DexsimError(f"{path}: the log has no tick of a policy to show")
+    count, measured = len(run.ticks), run.measured[: len(run.ticks)]
+    readings = {
+        name: np.stack([tick["readings"][name] for tick in run.ticks])
+        for name in ("object_position", "object_quat", "goal_quat", "command")
+    }
+    goals = readings["goal_quat"]
+    turns = np.cumsum(np.abs(np.diff(goals, axis=0, prepend=goals[:1])).max(-1) > 1e-6)
+    turned = bool(turns[-1])  # a task without goals has the same one in all ticks
+    snapshot = Snapshot(
+        joint_position=np.stack([now.joint_position for now in measured]),
+        object_position=readings["object_position"],
+        object_rotation=np.asarray(rotations.quat_to_matrix(readings["object_quat"])),
+        primitive_size=np.zeros((count, 0, 3)),
+        primitive_position=np.zeros((count, 0, 3)),
+        primitive_rotation=np.zeros((count, 0, 3, 3)),
+        primitive_active=np.zeros((count, 0), bool),
+        taxel_force=np.stack([now.taxel_force for now in measured]),
+        command=readings["command"],
+        target_force=np.full(count, np.nan, np.float32),
+        finger_force=np.stack([now.finger_force for now in measured]),
+        goal_rotation=np.asarray(rotations.quat_to_matrix(goals)) if turned else None,
+        turns=turns if turned else None,
+        seconds=np.asarray(run.time),
+    )
+    period = float(run.time[-1] / max(count - 1, 1)) or 0.03
+    return Episodes(task=run.report["task"], hand=run.hand, period=period, kinds=(), snapshots=[snapshot])

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from dexsim.hand.description import Hand
+from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.render.camera import look
 from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
 from dexsim.render.picture import Pose, hand_poses
-from dexsim.render.render import CAMERAS
+from dexsim.render.render import camera_of
 from dexsim.view.source import Frame
 
 _IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing
@@ -28,12 +28,12 @@ _FLOOR = 0.2  # m below the point that the camera looks at
 
 
 class Scene:
-    """A hand in the browser: on a server of viser, seen by a preset of `CAMERAS`, which also says where up is."""
+    """A hand in the browser: on a server of viser, seen by the camera of a task, which also says where up is."""
 
-    def __init__(self, server: Any, hand: Hand, camera: str):
+    def __init__(self, server: Any, hand: Hand, task: str):
         self._server, self._hand = server, hand
         self._shape: Any = None  # what the object looked like when it was last sent
-        view = CAMERAS[camera]
+        view = camera_of(task, hand)
         self._up = np.asarray(view.up, float)
         server.scene.set_up_direction(view.up)
         server.scene.configure_default_lights(True, cast_shadow=False)
@@ -60,7 +60,7 @@ class Scene:
         for number, geom in enumerate(hand.geoms):
             if geom.kind != "plane":
                 tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
-                mesh = primitive(geom.kind, geom.size)
+                mesh = primitive_mesh(geom.kind, geom.size)
                 server.scene.add_mesh_simple(
                     f"/hand/{hand.body_names[geom.body]}/{number}",
                     mesh.vertices,
@@ -131,7 +131,7 @@ class Scene:
         for root in ("object", "goal"):
             ghost = root == "goal"
             for k in active:
-                mesh = primitive(frame.kinds[k], snapshot.primitive_size[k])
+                mesh = primitive_mesh(frame.kinds[k], snapshot.primitive_size[k])
                 mesh.apply_scale(0.6 if ghost else 1.0)
                 parts = box_faces(mesh) if frame.kinds[k] == "box" and len(active) == 1 else [(OBJECT, mesh)]
                 for number, (color, part) in enumerate(parts):
@@ -157,20 +157,6 @@ def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
     centre = np.einsum("fn,fnk->fk", taxel_force, pose.taxel_position)[touching] / total[touching, None]
     # The head is at the skin, so that the arrow is outside of the finger.
     return np.stack([centre - _METRES_PER_NEWTON * force, centre], 1)
-
-
-def primitive(kind: str, size: np.ndarray) -> trimesh.Trimesh:
-    """A primitive as a mesh; `size` as in MuJoCo, m."""
-    a, b, c = (float(x) for x in size)
-    if kind == "box":
-        return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
-    if kind == "capsule":
-        return trimesh.creation.capsule(radius=a, height=2 * b, count=(48, 32))
-    if kind == "cylinder":
-        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=64)
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    ball.apply_scale((a, b, c) if kind == "ellipsoid" else a)
-    return ball
 
 
 def box_faces(box: trimesh.Trimesh) -> list[tuple[tuple[int, int, int], trimesh.Trimesh]]:

@@ -17,7 +17,6 @@ from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
-from dexsim.render.render import CAMERAS
 from dexsim.view.source import Button, Choice, Control, Frame, Slider, Values
 from dexsim_ppo.policy import Policy, load_policy
 
@@ -71,7 +70,7 @@ class Simulation:
 
     def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies
-        self.camera = env.name if env.name in CAMERAS else "grasp"
+        self.task = env.name
         self._random = np.random.default_rng(seed)
         self._key, self._ended = jax.random.key(seed), 0.0
         self._shapes = np.asarray(env.pool.object.shape_index)

@@ -47,8 +47,8 @@ class Source(Protocol):
     hand: Hand
     period: float
     """Time from one frame to the next, s."""
-    camera: str
-    """The preset of `dexsim.render.render.CAMERAS` that the page opens with."""
+    task: str
+    """Of whose preset camera the page opens with (`dexsim.render.render.camera_of`)."""
 
     def controls(self) -> dict[str, Control]:
         """What can be changed now, by name. Asked again while the view runs: options may come and go."""

@@ -39,7 +39,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
-        self.scene = Scene(self.server, hand, source.camera)
+        self.scene = Scene(self.server, hand, source.task)
         self._layout: Layout = make_layout(*_PANEL, hand.taxel_grid, hand.num_fingers)
         self._clicked: set[str] = set()
         self._handles: dict[str, Any] = {}

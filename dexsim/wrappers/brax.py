@@ -51,19 +51,15 @@ class BraxEnv(Env):
 
     The brax state holds our state, with random keys as raw data, in `pipeline_state`, and in `info`
     the key and `time_limit` (1 where the task's time limit was reached and it did not terminate).
+    The observation is a dictionary with an array for each group, chosen from by brax's `policy_obs_key` and
+    `value_obs_key`.
 
     Args:
       env: what `dexsim.make` returns.
-      observation_group: `"actor"` or `"critic"` for a plain array; None (default) for a dictionary
-        with an array for each group, chosen from by brax's `policy_obs_key` and `value_obs_key`.
     """
 
-    def __init__(self, env: Any, observation_group: str | None = None):
-        groups = env.observation_layout
-        if observation_group is not None and observation_group not in groups:
-            raise ConfigError(f"no observation group {observation_group!r}: choose from {', '.join(groups)}")
+    def __init__(self, env: Any):
         self.env = env
-        self._group = observation_group
         # Tells which leaves are random keys: brax cannot carry typed keys through its trainer.
         self._template = jax.eval_shape(env.reset, jax.random.key(0))
 
@@ -88,11 +84,8 @@ class BraxEnv(Env):
         )
 
     @property
-    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
-        sizes = {group: sum(field.size for field in fields) for group, fields in self.env.observation_layout.items()}
-        if self._group is not None:
-            return sizes[self._group]
-        return {group: (size,) for group, size in sizes.items()}
+    def observation_size(self) -> dict[str, tuple[int, ...]]:
+        return {group: (sum(field.size for field in fields),) for group, fields in self.env.observation_layout.items()}
 
     @property
     def action_size(self) -> int:
@@ -120,7 +113,7 @@ class BraxEnv(Env):
         own = {name: x.astype(jnp.float32) for name, x in state.metrics.items() if name not in _RUNNING_METRICS}
         return State(
             pipeline_state=jax.tree.map(_raw, state),
-            obs=dict(state.obs) if self._group is None else state.obs[self._group],
+            obs=dict(state.obs),
             reward=state.reward.astype(jnp.float32),
             done=terminated,
             metrics=carried | own,

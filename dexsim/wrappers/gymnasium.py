@@ -19,7 +19,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
-from dexsim.render.render import camera_of, render_frame
+from dexsim.render.render import render_frame
 
 try:
     import gymnasium
@@ -128,9 +128,9 @@ class GymVectorEnv(VectorEnv):
         if self.render_mode is None:
             return None
         snapshots = jax.device_get(self._snapshot(self._state))
-        camera = camera_of(self.env.name, self.env.hand)
+        env = self.env
         return tuple(
-            render_frame(self.env.hand, self.env.primitive_kinds, snapshots.map(lambda x, i=i: x[i]), camera=camera)
+            render_frame(env.hand, env.primitive_kinds, snapshots.map(lambda x, i=i: x[i]), camera=env.name)
             for i in range(self.num_envs)
         )
 

@@ -10,8 +10,6 @@ OPTIONS = {
     "dexsim_real.twin": ("dexsim_real.twin.server:TwinArguments", []),
     "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
     "dexsim.check_hand": ("dexsim.check_hand:CheckHandArguments", ["leap_like"]),
-    "dexsim.hand.mirror": ("dexsim.hand.mirror:MirrorHandArguments", ["leap_like", "--out", "x"]),
     "dexsim.import_hand": ("dexsim.import_hand:ImportArguments", ["hand.urdf", "--out", "x"]),
     "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
-    "dexsim.view.demo": ("dexsim.view.demo:DemoArguments", []),
 }

@@ -52,8 +52,8 @@ class GraspConfig(EnvConfig):
     """Training episode length. Short episodes practise the catch, in which most of the lost objects are lost."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
     """Evaluation episode length; the object must be held this long. Force is scored from 3 s on."""
-    finger_force: Range = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
-    """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose with four fingers."""
+    finger_force: Range | None = setting(None, unit="N", low=0.05, high=40.0)
+    """Target of each touching finger but the thumb, at command 0 and 1; None for those that the hand's TOML gives."""
     max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
     """Force that forces are normalised by."""
     push_probability: float = setting(0.015, unit="1", low=0.0, high=1.0)

@@ -97,14 +97,16 @@ class Grasp(Task):
     """What `ObjectParams.shape_index` counts."""
 
     config: GraspConfig
+    finger_force: tuple[float, float]
 
     def __init__(self, config: GraspConfig, hand: Hand):
         if not hand.grasp_centre or not (config.posture or hand.grasp_posture):
             raise ConfigError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
-        config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture)
+        force = config.finger_force or hand.grasp_force
+        config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture, finger_force=force)
         x, y, z = hand.grasp_centre
         self.config, self.hand, self.reference = config, hand, (x, y, z)
-        self.posture, self.finger_force = config.posture, config.finger_force
+        self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots, self._closing = hand.root_joint, closing(hand)
@@ -216,7 +218,7 @@ class Grasp(Task):
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def target_force(self, goal: GraspGoal) -> jax.Array:
-        return target_force(goal.command, self.config.finger_force)
+        return target_force(goal.command, self.finger_force)
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         chance, speed = self.config.push_probability, self.config.push_speed
@@ -296,5 +298,4 @@ class Grasp(Task):
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""
-        config = self.config
-        return summarize(metrics, alive, control_period, config.finger_force, self.shape_names)
+        return summarize(metrics, alive, control_period, self.finger_force, self.shape_names)

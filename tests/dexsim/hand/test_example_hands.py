@@ -42,5 +42,5 @@ def test_tips_are_where_the_published_chains_put_them(name):
 def test_passes_the_checks(name, capsys):
     assert check_hand.main([name]) == 0
     out = capsys.readouterr().out
-    assert out.count("ok  ") == 5 and "pairs" in out
+    assert out.count("ok  ") == 9 and "pairs" in out
     assert ("index_intermediate (x 1.064)" in out) == (name == "inspire_like")

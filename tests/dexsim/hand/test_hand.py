@@ -1,12 +1,13 @@
 """The hand: published kinematics, masses and taxels; C MuJoCo; a second, different hand; broken files."""
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
 from dexsim.check_hand import check_kinematics
 from dexsim.core.errors import AssetError
-from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
 
 # --- the shipped hand against published figures ------------------------------------------------
@@ -94,6 +95,26 @@ def test_finger_and_joint_tables(hand):
         "pinky_joint1",
     ]
     assert (hand.num_joints, hand.num_fingers, hand.num_taxels) == (12, 5, 120)
+
+
+@pytest.mark.parametrize("name", ["xhand_right", "leap_like"])
+def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(name):
+    """In C MuJoCo, which turns a force at the pad into joint torques."""
+    hand = load_hand(name)
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    data, joints = mujoco.MjData(model), [model.joint(joint) for joint in hand.joint_names]
+    data.qpos[[joint.qposadr[0] for joint in joints]] = hand.grasp_posture
+    mujoco.mj_fwdPosition(model, data)
+    for finger, force in enumerate(fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))):
+        body = model.body(hand.body_names[hand.tip_body[finger]]).id
+        frame = data.xmat[body].reshape(3, 3)
+        normal = frame @ hand.taxel_normal[finger].mean(0)
+        place = data.xpos[body] + frame @ hand.taxel_position[finger].mean(0)
+        torque = np.zeros(model.nv)
+        push = force * normal / np.linalg.norm(normal)
+        mujoco.mj_applyFT(model, data, push, np.zeros(3), place, body, torque)
+        share = np.abs(torque[[joint.dofadr[0] for joint in joints]]) / hand.torque_limit
+        np.testing.assert_allclose(share.max(), 1.0, rtol=1e-4)
 
 
 # --- taxels ------------------------------------------------------------------------------------

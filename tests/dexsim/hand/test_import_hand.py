@@ -1,6 +1,7 @@
 """Hands from makers' files. The stand-ins have the quirks of public ones: a URDF's frames and packages, joints that are
 turned round, a wrist above the palm, followers, tendons, absent meshes and torques."""
 
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -11,9 +12,12 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
 from dexsim.hand.fit import fit_capsule, fit_palm, segment_distance
 from dexsim.hand.folder import write_hand
-from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.vendor import read_description
+from dexsim.randomization import Randomization, sample_hand
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
 
 TURN = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()  # of the file's palm against ours
 ROOTS = {"index": (0, 0.035, 0.09), "middle": (0, 0.01, 0.095), "ring": (0, -0.015, 0.09), "thumb": (0.01, 0.05, 0.02)}
@@ -84,7 +88,9 @@ def transform(turn):
 
 def sheet_of(path, **options):
     anatomy = orient(read_description(path, **options))
-    return anatomy, *import_hand.make_sheet(anatomy, "hand", 0.0, 0.0, path.name, 0.006)
+    sheet, _ = import_hand.make_sheet(anatomy, "hand", 0.0, 0.0, path.name)
+    sheet, grasp = import_hand.close_hand(sheet, anatomy.fingers, 0.006)
+    return anatomy, sheet, import_hand.table(sheet, grasp)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +155,26 @@ def test_the_whole_command(tmp_path, capsys):
     hand = load_hand(tmp_path / "out" / "out.toml")
     assert hand.num_joints == 8 and hand.num_hinges == 12
     np.testing.assert_allclose(sorted(set(hand.body_ratio.round(5))), [0.8, 1.0])
+    # What the thumb can oppose, and gains in proportion to stall torques.
+    low, high = Grasp(GraspConfig(), hand).finger_force
+    thumb, *others = fingertip_strength(hand, np.float32(hand.grasp_posture))
+    assert low == pytest.approx(max(high / 4, 1.0), abs=1e-3)
+    assert high == pytest.approx(min(thumb / 2.75, *others), abs=1e-3)
+    nominal = sample_hand(jax.random.key(0), Randomization(scale=0), hand, timestep=0.01, control_period=0.03)
+    np.testing.assert_allclose(nominal.actuator.stiffness, 3.0 / 1.1, rtol=1e-3)
+    np.testing.assert_allclose(nominal.actuator.damping, 0.1 / 1.1, rtol=1e-3)
+
+
+def test_an_imported_hand_can_be_mirrored(tmp_path, monkeypatch):
+    monkeypatch.delitem(check_hand.CHECKS, "random actions stay finite")  # it takes seconds
+    path = urdf(tmp_path)
+    for options in ([], ["--mirror"]):
+        out = str(tmp_path / "".join(["out", *options]))
+        assert import_hand.main([str(path), "--name", "left_one", "--out", out, "--yes", *options]) == 0
+    plain, mirrored = (load_hand(tmp_path / out / "left_one.toml") for out in ("out", "out--mirror"))
+    assert (plain.side, mirrored.side) == ("right", "left") and plain.grasp_posture == mirrored.grasp_posture
+    tips = [forward_kinematics(hand, np.float32(hand.grasp_posture)).tip_position for hand in (plain, mirrored)]
+    np.testing.assert_allclose(tips[1], np.asarray(tips[0]) * [1, -1, 1], atol=1e-6)
 
 
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size="0.015 0.05 0.05"/>
@@ -192,7 +218,7 @@ REFUSED = {
     "polynomial": (
         dict(tail='<equality><joint joint1="f_b" joint2="f_a" polycoef="0 1 0.2 0 0"/></equality>'),
         {},
-        "'f_b' follows 'f_a' by the polynomial",
+        "'f_b' follows 'f_a' by the polycoef",
     ),
 }
 

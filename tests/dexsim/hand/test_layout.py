@@ -11,7 +11,6 @@ from shapes import solid
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.geometry import sdf
-from dexsim.geometry.mesh import load_mesh
 from dexsim.hand import layout
 from dexsim.hand.load import load_hand
 
@@ -56,26 +55,6 @@ def test_patches_lie_on_their_surface(kind, sizes, shape):
     assert np.all((chord > 2 * radius * np.sin(0.001 / radius) - 1e-9) & (chord < 0.002 + 1e-9))
     across = np.linalg.norm(np.diff(grid[:, 4], axis=0), axis=1)
     np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
-
-
-def test_a_patch_of_a_mesh():
-    """On a fine ball the rays meet the sphere, and the areas are those of the surface below the cells."""
-    trimesh = pytest.importorskip("trimesh")
-    ball = load_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.02))
-    points = layout.lattice(9, 7, pitch=0.002)
-    patch = layout.on_mesh(ball, points, origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
-    np.testing.assert_allclose(np.linalg.norm(patch.position, axis=1), 0.02, atol=6e-5)
-    np.testing.assert_allclose(patch.position[:, 2], points.v, atol=1e-12)
-    np.testing.assert_allclose(np.sort(np.unique(np.round(patch.position[:, 1], 9))), np.unique(np.round(points.u, 9)))
-    # Columns run so that (across, along, outward) is right-handed, as on the primitives.
-    across = patch.position[-7] - patch.position[0]
-    assert np.cross(across, [0, 0, 1]) @ [1, 0, 0] > 0
-    cosine = np.sqrt(1 - (points.u**2 + points.v**2) / 0.02**2)
-    np.testing.assert_allclose(patch.area, 0.002**2 / cosine, rtol=0.03)
-    with pytest.raises(AssetError, match="misses the mesh or grazes it"):
-        layout.on_mesh(ball, layout.lattice(9, 7, pitch=0.01), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
-    with pytest.raises(AssetError, match="misses the mesh or grazes it"):
-        layout.on_mesh(ball, layout.lattice(2, 2, pitch=0.0279), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
 
 
 def test_the_hand_reads_what_was_written(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dexsim import import_hand
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.geometry import rotations
@@ -20,7 +21,7 @@ from dexsim.hand.description import Hand
 from dexsim.hand.files import find_hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
-from dexsim.hand.mirror import is_mirror_image, main, mirror_hand, mirror_mjcf, swap_sides, write_mirror
+from dexsim.hand.mirror import is_mirror_image, mirror_hand, mirror_mjcf, swap_sides, write_mirror
 from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, Readings, mirror_readings, observe
 
 HANDS = ("xhand_right", "leap_like", "inspire_like")
@@ -48,8 +49,8 @@ def same(one: Hand, other: Hand, *apart: str) -> None:
 
 
 def test_the_shipped_left_hand_is_what_the_command_writes(tmp_path, capsys):
-    assert main(["xhand_right", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.strip() == str(tmp_path / "xhand_left.toml")
+    assert import_hand.main(["xhand_right", "--mirror", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == f"wrote {tmp_path / 'xhand_left.toml'}"
     shipped = asset_path("hand/xhand_left")
     assert sorted(path.name for path in shipped.iterdir()) == sorted(path.name for path in tmp_path.iterdir())
     for path in tmp_path.iterdir():

@@ -131,15 +131,6 @@ def test_heat_map_cell_lies_where_documented():
     assert image.shape == (12, 10) and image[0, 0] == 11 and image[11, 0] == 0 and image[11, 1] == 12
 
 
-@pytest.mark.parametrize("active", ["box", None])
-def test_frame_of_every_kind(hand, active):
-    frame = render.render_frame(hand, KINDS, snapshot(hand, active=active), size=SMALL)
-    assert frame.shape == (240, 320, 3) and frame.dtype == np.uint8
-    bare = render.render_frame(hand, KINDS, snapshot(hand, active=None), size=SMALL)
-    changed = np.any(frame[:, :200] != bare[:, :200], -1).mean()
-    assert (changed > 0.01) == (active is not None)
-
-
 def test_a_loaded_taxel_shows_on_the_finger(hand):
     """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
     cold = snapshot(hand, active=None)

@@ -131,8 +131,5 @@ def test_a_learner_in_the_manner_of_cleanrl_learns_through_gymnasiums_wrappers()
 def test_what_does_not_fit_is_one_line(arguments, message):
     with pytest.raises(ConfigError, match=message):
         GymVectorEnv(TinyEnv(), 2, **arguments)
-
-
-def test_a_step_before_the_first_reset_is_an_error():
     with pytest.raises(ConfigError, match="reset the environment before"):
         GymVectorEnv(TinyEnv(), 1).step(np.zeros((1, 1)))
