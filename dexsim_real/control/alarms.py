@@ -18,6 +18,7 @@ _STILL = 0.05  # rad, motion below which a joint with high current is stalled
 _FAR, _IDLE = 0.3, 0.15  # rad, A: so far from its command a joint draws 0.8 A, even at a fifth of the stiffness 0.16 A
 _MOVED = 0.2  # rad, motion of a command that changes some joint's angle
 _UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
+_BREAK = 0.1  # s without a finding after which it is over
 _FORGIVEN = 0.25  # serious refusals that one other answer makes up for
 
 
@@ -36,18 +37,20 @@ def joint_labels(hand: Hand) -> tuple[str, ...]:
 class Lasting:
     """How long each of some findings has lasted: the time between two answers with it, less that before one without.
 
-    So a single wrong answer neither makes a finding nor ends one.
+    So a single wrong answer neither makes a finding nor ends one; after a longer break it begins anew.
     """
 
     def __init__(self) -> None:
         self.seconds: np.ndarray = np.zeros(())
-        self._time, self._active = 0.0, np.zeros((), bool)
+        self._time, self._active, self._seen = 0.0, np.zeros((), bool), np.zeros(())
 
     def update(self, time: float, active: np.ndarray | bool) -> np.ndarray:
         """Seconds of each finding, by an answer at a time in s; -1 for one that is not `active` in it."""
         active = np.asarray(active)
         gap, before = time - self._time, self._active
-        self.seconds = np.where(active, self.seconds + gap * before, np.maximum(self.seconds - gap, 0.0))
+        self._seen = np.where(active, time, self._seen)  # s, last answer with it
+        less = np.where(time - self._seen > _BREAK, 0.0, np.maximum(self.seconds - gap, 0.0))
+        self.seconds = np.where(active, self.seconds + gap * before, less)
         self._time, self._active = time, active
         return np.where(active, self.seconds, -1.0)
 
