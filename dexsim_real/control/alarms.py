@@ -5,6 +5,7 @@ public, so every bit counts unless it is listed as harmless. Each finding is one
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies
@@ -44,7 +45,7 @@ class Lasting:
         self.seconds: np.ndarray = np.zeros(())
         self._time, self._active, self._seen = 0.0, np.zeros((), bool), np.zeros(())
 
-    def update(self, time: float, active: np.ndarray | bool) -> np.ndarray:
+    def update(self, time: float, active: npt.ArrayLike) -> np.ndarray:
         """Seconds of each finding, by an answer at a time in s; -1 for one that is not `active` in it."""
         active = np.asarray(active)
         gap, before = time - self._time, self._active
