@@ -89,7 +89,8 @@ def test_a_wrong_answer_now_and_then_hides_no_trouble(bench, trouble, every, wit
         fields = dict(trouble)
         if k % every == 0 and wrong == "measurement":
             fields = {name: fields[name] for name in ("target", "follow") if name in fields}
-        read = MIDDLE + np.float32(0.06) * FREE if k % every == 0 and wrong == "angle" else None
+        off = 0.06 if k % every == 0 and wrong == "angle" else 1e-3 * (k % 2)  # Angles that never change are frozen.
+        read = MIDDLE + np.float32(off) * FREE
         cycle(bench, read=read, **fields)
         if bench.safety.latched:
             break
