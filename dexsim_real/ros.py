@@ -10,9 +10,8 @@
 | `~/commands` | std_msgs/Float64MultiArray | joint targets [J] rad, as for `forward_command_controller` |
 | `~/motors` | std_srvs/SetBool | motors on at the measured pose; off for good |
 
-Commands are a stream: without one for `--safety.watchdog` the hand holds, then its motors go off. With the parameter
-`policy` the policy gives the targets once the motors are on, and `~/commands` does not exist. The parameter `options`
-has further options of `NodeOptions` as on a command line. rclpy is imported when the node runs.
+Commands are a stream: without one for `--safety.watchdog` the hand holds, then its motors go off. The parameter
+`options` has further options of `NodeOptions` as on a command line. rclpy is imported when the node runs.
 """
 
 import dataclasses
@@ -23,21 +22,16 @@ from typing import Any
 import numpy as np
 
 from dexsim import load_hand
-from dexsim.calibration.maps import calibrated_hand, load_calibration
+from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
 from dexsim.hand.description import Hand
-from dexsim.hand.source import recorded_hand
-from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller, prepare_jax
+from dexsim_real.control.controller import prepare_jax
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Safety
-from dexsim_real.core.errors import HandError
 from dexsim_real.loop import LoopThread
 from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.sensors.object_sensors import ObjectSensors
 from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.link import LinkConfig, greet, missing_of
 from dexsim_real.wire.serial_hand import open_port
@@ -49,10 +43,6 @@ class NodeOptions(Config):
 
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
     """Exchanges with the hand, and messages, per second."""
-    command: float = setting(0.5, unit="1", low=0.0, high=1.0)
-    """Grip command of the policy."""
-    approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
-    """Time to the policy's start posture."""
     guard: bool = True
     """Start a second process that turns the motors off when this one dies or freezes."""
     link: LinkConfig = setting(LinkConfig())
@@ -66,7 +56,7 @@ class NodeOptions(Config):
 class HandNode:
     """The hand behind a `rclpy` node. `start` connects it with the motors off.
 
-    Raises DexsimError: hand, calibration, policy or port do not fit together.
+    Raises DexsimError: hand, calibration or port do not fit together.
     """
 
     def __init__(self, node: Any):
@@ -76,41 +66,19 @@ class HandNode:
         from std_srvs.srv import SetBool
 
         self.node, self._joint_state, self._wrench = node, JointState, WrenchStamped
-        given = {name: node.declare_parameter(name, "").value for name in ("port", "hand", "calibration", "policy")}
+        given = {name: node.declare_parameter(name, "").value for name in ("port", "hand", "calibration")}
         words = shlex.split(node.declare_parameter("options", "").value)
         self.options = options = cli.parse(NodeOptions, words, prog="options", description="Options of the node.")
-        policy = load_policy(given["policy"]) if given["policy"] else None
-        recorded = recorded_hand(policy.hand, given["hand"], given["policy"]) if policy else None
-        self.hand = hand = recorded or load_hand(given["hand"] or None)
+        self.hand = hand = load_hand(given["hand"] or None)
         calibration = load_calibration(Path(given["calibration"]), hand) if given["calibration"] else None
         self.sensing = HandSensing(hand, options.hardware, calibration)
-        self.port, limits = open_port(given["port"], hand, options.link), options.safety
-        self.policy: PolicyLoop | None = None
-        controller = None
-        if policy:
-            controller = Controller(policy, calibrated_hand(hand, calibration))
-            if "imu" in controller.sources:
-                raise HandError(f"{given['policy']} observes the object's orientation: use `python -m dexsim_real.run`")
-            controller.check_measured(missing_of(self.port))
-            controller.warm()
-            limits = limits_for(limits, controller)
-        self.safety = Safety(hand, limits, node.get_logger().info)
+        self.port = open_port(given["port"], hand, options.link)
+        self.safety = Safety(hand, options.safety, node.get_logger().info)
         self.guard = Guard(given["port"], options.link, hand) if options.guard else None
         beat = self.guard.beat if self.guard else lambda more: None
         self.loop = LoopThread(self.port, self.sensing, self.safety, options.rate, beat)
-        if controller:
-            self.policy = PolicyLoop(
-                controller,
-                self.safety,
-                ObjectSensors(np.asarray(controller.spec.reference, float), None, None),
-                command=options.command,
-                approach=options.approach,
-                place=0.0,
-            )
-            node.create_timer(controller.period, self.tick)
-        else:
-            node.create_subscription(Float64MultiArray, "~/commands", self.take_command, 1)
-        self._began, self._shown = False, -1  # whether the policy has begun; sequence number of the newest message
+        self._shown = -1  # sequence number of the newest message
+        node.create_subscription(Float64MultiArray, "~/commands", self.take_command, 1)
         self._joints = node.create_publisher(JointState, "joint_states", 10)
         self._wrenches = [node.create_publisher(WrenchStamped, f"~/wrenches/{f}", 10) for f in hand.finger_names]
         self._taxels = node.create_publisher(Float32MultiArray, "~/taxels", 10)
@@ -158,19 +126,6 @@ class HandNode:
             self.node.get_logger().error(f"{len(message.data)} joint targets, expected {self.hand.num_joints}")
             return
         self.safety.set_target(np.asarray(message.data, np.float32), self.loop.clock())
-
-    def tick(self) -> None:
-        """The policy's turn: first to the start posture, then one action."""
-        assert self.policy is not None
-        now = self.loop.clock()
-        if not self.safety.anchor or self.safety.latched:  # The motors are not on yet, or off for good.
-            return
-        if not self._began:
-            self._began = not self.policy.approach(now)
-            if self._began:
-                self.policy.begin()
-        if self._began:
-            self.policy.tick(now)
 
     def publish(self) -> None:
         """Publish the newest measurement, once. HandError: the exchange loop has failed."""

@@ -5,6 +5,7 @@ public, so every bit counts unless it is listed as harmless. Each finding is one
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies
@@ -18,6 +19,8 @@ _STILL = 0.05  # rad, motion below which a joint with high current is stalled
 _FAR, _IDLE = 0.3, 0.15  # rad, A: so far from its command a joint draws 0.8 A, even at a fifth of the stiffness 0.16 A
 _MOVED = 0.2  # rad, motion of a command that changes some joint's angle
 _UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
+_BREAK = 0.1  # s without a finding after which it is over
+_FORGIVEN = 0.25  # serious refusals that one other answer makes up for
 
 
 def finger_joints(hand: Hand, finger: int) -> list[int]:
@@ -32,16 +35,25 @@ def joint_labels(hand: Hand) -> tuple[str, ...]:
     return tuple(f"joint {name} ({fingers[joint]})" for joint, name in enumerate(hand.joint_names))
 
 
-class _Timer:
-    """How long a finding has lasted without a break."""
+class Lasting:
+    """How long each of some findings has lasted: the time between two answers with it, less that before one without.
+
+    So a single wrong answer neither makes a finding nor ends one; after a longer break it begins anew.
+    """
 
     def __init__(self) -> None:
-        self._since: float | None = None
+        self.seconds: np.ndarray = np.zeros(())
+        self._time, self._active, self._seen = 0.0, np.zeros((), bool), np.zeros(())
 
-    def lasts(self, time: float, active: bool) -> float:
-        """Seconds from the first answer with this finding to this one; -1 without it."""
-        self._since = (time if self._since is None else self._since) if active else None
-        return -1.0 if self._since is None else time - self._since
+    def update(self, time: float, active: npt.ArrayLike) -> np.ndarray:
+        """Seconds of each finding, by an answer at a time in s; -1 for one that is not `active` in it."""
+        active = np.asarray(active)
+        gap, before = time - self._time, self._active
+        self._seen = np.where(active, time, self._seen)  # s, last answer with it
+        less = np.where(time - self._seen > _BREAK, 0.0, np.maximum(self.seconds - gap, 0.0))
+        self.seconds = np.where(active, self.seconds + gap * before, less)
+        self._time, self._active = time, active
+        return np.where(active, self.seconds, -1.0)
 
 
 class Alarms:
@@ -55,18 +67,16 @@ class Alarms:
         self._joints = joint_labels(hand)
         self._parts = (*self._joints, *(f"fingertip of the {name}" for name in hand.finger_names), "palm board")
         self._harmless = np.array(config.ignored_errors, np.uint16)
-        self._hot, self._current, self._error, self._off = _Timer(), _Timer(), _Timer(), _Timer()
-        self._follows, self._lost = np.full(hand.num_joints, np.inf), _Timer()  # [J] s, when a joint last followed
-        self._frozen = _Timer()
+        self._hot, self._current, self._stalled = Lasting(), Lasting(), Lasting()
+        self._error, self._off, self._away, self._frozen, self._lost = (Lasting() for _ in range(5))
         self._changed: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, angles as they changed last, command then
         self._reports_mode = False  # whether the hand has ever reported that its motors are on
-        self._moved_at: np.ndarray | None = None  # [J] s, since when a joint neither moved nor had a low current
-        self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, its angle then
-        self._serious = 0  # serious refusals in a row
+        self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, where a joint with a high current was at first
+        self._serious = 0.0  # serious refusals, less the forgiven ones
 
     def update(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
         """Judge an answer at a time in s to a command [J] rad; None with the motors off."""
-        self.refused, self._serious = "", 0
+        self.refused, self._serious = "", max(self._serious - _FORGIVEN, 0.0)
         sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
         waiting = (
             self._errors(time, measured),
@@ -80,8 +90,8 @@ class Alarms:
     def refuse(self, refusal: Refusal) -> None:
         """Judge an answer in which the hand refuses the command."""
         self.refused = refusal.text
-        self._serious = self._serious + 1 if refusal.serious else 0
-        if self._serious > 1:
+        self._serious = self._serious + 1 if refusal.serious else max(self._serious - _FORGIVEN, 0.0)
+        if self._serious >= 2:
             self.fatal = refusal.text
 
     # --- findings -------------------------------------------------------------------------------
@@ -89,13 +99,13 @@ class Alarms:
     def _heat(self, time: float, measured: HandMeasurement) -> str:
         hottest = int(measured.temperature.argmax())
         degrees = measured.temperature[hottest]
-        if self._hot.lasts(time, bool(degrees > self.config.temperature)) <= 0:
+        if self._hot.update(time, degrees > self.config.temperature) <= 0:
             return ""
         return f"too hot: {self._parts[hottest]}, {degrees:.0f} degC"
 
     def _overcurrent(self, time: float, measured: HandMeasurement) -> str:
         joint = int(measured.current.argmax())
-        lasts = self._current.lasts(time, bool(measured.current[joint] > self.config.current))
+        lasts = self._current.update(time, measured.current[joint] > self.config.current)
         if lasts <= self.config.current_seconds:
             return ""
         return f"current too high: {measured.current[joint]:.2f} A in {self._joints[joint]}"
@@ -103,48 +113,46 @@ class Alarms:
     def _stall(self, time: float, measured: HandMeasurement) -> str:
         position = measured.joint_position
         # A current that is not measured (NaN) is above nothing.
-        fine = ~(measured.current > self.config.stall_current) | (np.abs(position - self._stood) > _STILL)
-        since = np.full(len(position), time) if self._moved_at is None else np.where(fine, time, self._moved_at)
-        self._moved_at, self._stood = since, np.where(since == time, position, self._stood)
-        joint = int(since.argmin())
-        if time - since[joint] <= self.config.stall_seconds:
+        still = (measured.current > self.config.stall_current) & (np.abs(position - self._stood) <= _STILL)
+        lasts = self._stalled.update(time, still)
+        self._stood = np.where(self._stalled.seconds > 0, self._stood, position)
+        joint = int(lasts.argmax())
+        if lasts[joint] <= self.config.stall_seconds:
             return ""
         return f"stalled: {self._joints[joint]} draws {measured.current[joint]:.2f} A without moving"
 
-    def _errors(self, time: float, measured: HandMeasurement) -> tuple[str, float]:
+    def _errors(self, time: float, measured: HandMeasurement) -> tuple[str, np.ndarray]:
         bits = measured.errors & ~self._harmless
-        lasts = self._error.lasts(time, bool(bits.any()))
+        lasts = self._error.update(time, bits.any())
         if lasts < 0:
             return "", lasts
         joint, board = np.unravel_index(int((bits != 0).argmax()), bits.shape)
         return f"error bits 0x{bits[joint, board]:04x} of the {_BOARDS[board]} board, {self._joints[joint]}", lasts
 
-    def _switched_off(self, time: float, measured: HandMeasurement, on: bool) -> tuple[str, float]:
+    def _switched_off(self, time: float, measured: HandMeasurement, on: bool) -> tuple[str, np.ndarray]:
         """Whether motors are off that were commanded to be on. Old firmware may not report the mode at all."""
         off = measured.mode != Mode.POSITION
         self._reports_mode |= on and not off.all()
-        lasts = self._off.lasts(time, bool(on and self._reports_mode and off.any()))
+        lasts = self._off.update(time, on and self._reports_mode and off.any())
         if lasts <= 0:
             return "", lasts
         joint = int(off.argmax())
         which = "all joints report" if off.all() else f"{self._joints[joint]} reports"
         return f"the hand switched itself off: {which} mode {measured.mode[joint]}", lasts
 
-    def _deaf(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> tuple[str, float]:
+    def _deaf(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> tuple[str, np.ndarray]:
         """Angles that do not follow the commands: frozen, of another joint, or of motors without power."""
         text, position = "", measured.joint_position
         goal = position if command is None else command
         if command is None or self._changed is None or np.any(position != self._changed[0]):
             self._changed = position, goal
-        moved = bool(np.abs(goal - self._changed[1]).max() > _MOVED)
-        if self._frozen.lasts(time, moved) > _UNNOTICED:
+        if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
-        away = (np.abs(goal - position) > _FAR) & (measured.current < _IDLE)
-        self._follows = np.where(away, self._follows, time)
-        joint = int(self._follows.argmin())
-        if not text and time - self._follows[joint] > _UNNOTICED:
+        lasts = self._away.update(time, (np.abs(goal - position) > _FAR) & (measured.current < _IDLE))
+        joint = int(lasts.argmax())
+        if not text and lasts[joint] > _UNNOTICED:
             text = (
                 f"{self._joints[joint]} does not follow its command: "
                 f"at {position[joint]:.2f} rad, commanded to {goal[joint]:.2f} rad"
             )
-        return text, self._lost.lasts(time, bool(text))
+        return text, self._lost.update(time, bool(text))

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dexsim.hand.description import Hand
-from dexsim_real.control.alarms import Alarms, joint_labels
+from dexsim_real.control.alarms import Alarms, Lasting, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.core.errors import HandError
@@ -105,9 +105,9 @@ class Safety:
         self._alarms = Alarms(hand, config)
         self._joints = joint_labels(hand)
         self._generation: int | None = None
-        self._wrong: tuple[float, float] | None = None  # s, first and last of the newest wrong measurements
+        self._wrong = Lasting()  # measurements that were wrong
         self._holding = False
-        self._held = 0.0  # s, balance of `_LONGEST` and `_RECOVERY`
+        self._held = 0.0  # s, balance of `_LONGEST` and `_RECOVERY`; a restart after a silence forgives nothing
         self._eased: tuple[float, np.ndarray] | None = None  # last hold for force: s, its end; [J] rad, pose before it
         self._on = 0.0  # s, when the motors came on
         self._commanded: np.ndarray | None = None  # last command with the motors on
@@ -139,9 +139,10 @@ class Safety:
             self.problem = self._pose.judge(sample.time, measured.joint_position, self._commanded)
         if self.problem:
             self.counts["implausible: measurement"] += 1
-            self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
+            self._wrong.update(sample.time, True)
             return False
-        self.sample, self._wrong = sample, None
+        self.sample = sample
+        self._wrong.update(sample.time, False)
         self._alarms.update(sample.time, measured, self._commanded)
         return True
 
@@ -185,13 +186,14 @@ class Safety:
             self._start(now, pose)
         request = self._target  # Read once: another thread may replace it meanwhile.
         if lasted := self._lasted(now, sample, request):
-            return self._turn_off(now, lasted, self.config.patience)
-        reason = self._reason_to_hold(now, sample, request)
-        if not reason.startswith(_SILENT):  # Silence has its own limit, and does not end a run.
-            since = max(now - self._time, 0.0)
-            self._held = self._held + since if reason else max(self._held - _RECOVERY * since, 0.0)
+            if not lasted.startswith(_SILENT):  # One silence does not end a run.
+                self.relax(f"{lasted} for {self.config.patience:g} s")
+            return self._turn_off(now, lasted)
+        reason, since = self._reason_to_hold(now, sample, request), max(now - self._time, 0.0)
+        self._held = self._held + since if reason else max(self._held - _RECOVERY * since, 0.0)
         if self._held > _LONGEST:
-            return self._turn_off(now, reason, _LONGEST)
+            self.relax(f"{reason} for {_LONGEST:g} s")
+            return self._turn_off(now, reason)
         if reason:
             return self._hold(now, reason)
         if self._holding:
@@ -199,7 +201,7 @@ class Safety:
         return self._follow(now, sample, self.commanded if request is None else request.position)
 
     def _fatal(self) -> str:
-        if self._wrong is not None and self._wrong[1] - self._wrong[0] > self.config.patience:
+        if self.problem and self._wrong.seconds > self.config.patience:
             return f"implausible measurements for {self.config.patience:g} s: {self.problem}"
         return self._alarms.fatal
 
@@ -239,7 +241,7 @@ class Safety:
         # Between the end stops, not within the margin: enabling must not move the hand.
         self._commanded = self._confirmed = np.clip(pose, *self._stops).astype(np.float32)
         self._time = self._on = now
-        self._held, self._eased = 0.0, None
+        self._eased = None
         self._restart(now)
 
     def _restart(self, now: float) -> None:
@@ -247,12 +249,10 @@ class Safety:
         self._holding, self._ramp_start = False, max(now, self._on + _SOFT)
         self.anchor += 1
 
-    def _turn_off(self, now: float, reason: str, seconds: float) -> SafetyDecision:
-        if not reason.startswith(_SILENT):
-            self.relax(f"{reason} for {seconds:g} s")
-        elif not self.problem:
-            self._pose.release()
+    def _turn_off(self, now: float, reason: str) -> SafetyDecision:
         # With the motors off the pose may change: restart from the next one that is known.
+        if not self.problem:
+            self._pose.release()
         self._commanded = self._confirmed = None
         return self._finish(now, Reaction.RELAX, reason, self._rest())
 

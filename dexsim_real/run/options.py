@@ -49,8 +49,6 @@ class RunArguments(Config):
     """Run without a camera: assume that the object stays at its nominal position."""
     guard: bool = True
     """Start a second process that turns the motors off when this one dies or freezes."""
-    tare: bool = True
-    """Tare the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
     """Exchanges per second, adjusted by up to 1 % so that the policy computes during the wait for an answer."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)

@@ -214,9 +214,8 @@ class Session:
             self._note(line)
         for note in check_identity(getattr(self.port, "identity", None), sensing.hand, sensing.calibration):
             self._note(note)
-        if arguments.tare:
-            for line in self.loop.tare():
-                self._note(f"warning: {line}")
+        for line in self.loop.tare():
+            self._note(f"warning: {line}")
         self._write_meta()
         self.loop.start()
         self._await_pose()

@@ -21,8 +21,9 @@ HEAD = b"\xaa\xaa"
 SIZE = 19
 BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
+_PERIOD = 0.01  # s between two samples
 _FASTEST = 30.0  # rad/s that an object may turn
-_JUMP = 0.3  # rad, for samples that arrive together
+_JUMP = 0.1  # rad, noise
 _GAP = 0.05  # s, longest motion that an interval between two samples explains
 _SAMPLES = 5  # in a row that are far from the last make a jump: a damaged frame may have a right checksum
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -115,7 +116,8 @@ class ImuReader:
     """From an IMU's bytes to the orientation of the object in the palm frame.
 
     A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
-    the last than an object turns is left out; when the next ones are, too, `jumped` is true until they come back.
+    the last sound one than an object turns between two samples is left out; when the next ones are, too, `jumped` is
+    true until they come back.
     `mount` [4] is the orientation of the IMU in the object, `port` its name for messages.
     """
 
@@ -124,7 +126,7 @@ class ImuReader:
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
-        self._last_index, self._far = -1, 0  # index of the last frame; samples in a row that are far from the last
+        self._last_index, self._far = -1, 0  # index of the last frame; samples in a row far from the last sound one
 
     @property
     def jumped(self) -> bool:
@@ -136,10 +138,12 @@ class ImuReader:
         for index, quat in self.parser.feed(data):
             if index == self._last_index:
                 continue
+            # By the index and not by the time: samples that waited arrive together.
+            gap = _PERIOD * ((index - self._last_index) % 256)
             self._last_index = index
-            when, before = self._newest or (time, quat)
+            before = quat if self._newest is None else self._newest[1]
             angle = 2.0 * math.acos(min(abs(float(quat @ before)), 1.0))
-            self._far = self._far + 1 if angle > _JUMP + _FASTEST * min(time - when, _GAP) else 0
+            self._far = self._far + 1 if angle > _JUMP + _FASTEST * min(gap, _GAP) else 0
             if self._far == 0 or (self.jumped and self._world is None):  # Nothing relies on the last one yet.
                 # q and -q are one orientation: take the one nearer to the last, as in simulation.
                 self._newest, self._far = (time, quat if quat @ before >= 0 else -quat), 0

@@ -6,19 +6,16 @@ statistics, and the blocks of `dexsim_real.wire.frames`, so that loop, safety, l
 """
 
 import dataclasses
-import time
-from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire.frames import HOST, Command, Frame, Mode, driver_block, palm_address, passive_command
-from dexsim_real.wire.link import LinkConfig, LinkCounts, Refusal, Reply
+from dexsim_real.wire.link import LinkConfig, ReconnectingPort, Refusal, Reply
 
 NEWTONS_PER_COUNT = 0.1  # of the blocks' taxel counts; the default of `--hardware.force-per-count`
-_PAUSE = 0.002  # s, of a call while the hand is gone
 WITHOUT = {
     "taxels": "no taxels: policies cannot observe contact_force, contact_centre or finger_force; --safety.finger-force"
     " and --safety.total-force are off; calibrate has only --identify",
@@ -85,34 +82,18 @@ class HandDriver(Protocol):
         ...
 
 
-class DriverPort:
-    """`HandPort` of a hand that has a driver.
+class DriverPort(ReconnectingPort):
+    """`HandPort` of a hand that has a driver; `options` are those of `ReconnectingPort`.
 
-    Args:
-      hand: gives the number of joints, fingers and taxels.
-      config: how long to wait before connecting again.
-      tap: as for `SerialHand`: called with ("tx" or "rx", bytes of a frame), for the log.
-      clock: s, in which replies are stamped; that of the exchange loop.
+    `hand` gives the number of joints, fingers and taxels.
     """
 
     identity = None
 
-    def __init__(
-        self,
-        driver: HandDriver,
-        hand: Hand,
-        config: LinkConfig,
-        *,
-        tap: Callable[[str, bytes], None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self.driver, self.counts = driver, LinkCounts()
-        self.refusal: Refusal | None = None
-        self._hand, self._config, self._clock = hand, config, clock
+    def __init__(self, driver: HandDriver, hand: Hand, config: LinkConfig, **options: Any):
+        super().__init__(config, passive_command(hand.num_joints), **options)
+        self.driver, self._hand = driver, hand
         self._block = driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)
-        self._tap = tap or (lambda direction, data: None)
-        self._generation, self._connected = 0, False
-        self._retry_at, self._pause = 0.0, config.backoff[0]
 
     @property
     def missing(self) -> list[str]:
@@ -133,44 +114,29 @@ class DriverPort:
         self._generation += 1
         return line
 
-    def exchange(self, command: np.ndarray) -> Reply | None:
-        """See `HandPort.exchange`."""
-        self.refusal = None
-        try:
-            if not self._connected:
-                return self._reconnect()
-            return self._exchange(command)
-        except OSError:
-            self.counts.lost += self._connected
-            self.close()
-            self._retry_at = self._clock() + self._pause
-            self._pause = min(2 * self._pause, self._config.backoff[1])
-            return None
-
     def close(self) -> None:
-        """Close the line. The motors keep doing what they were told last."""
+        """See `ReconnectingPort.close`."""
         self._connected = False
         self.driver.close()
 
-    def _reconnect(self) -> Reply | None:
-        if self._clock() < self._retry_at:
-            time.sleep(_PAUSE)
-            return None
+    def _reopen(self) -> None:
         try:
             self.connect()
         except HandError as error:
             raise OSError from error
-        self.counts.reconnects += 1
-        self._pause = self._config.backoff[0]
-        return self._exchange(passive_command(self._hand.num_joints))
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1
         sent, on = self._clock(), bool(np.all(command["mode"] == Mode.POSITION))
         self._tap("tx", Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes()).encode())
         kp, ki, kd = (command[name].astype(float) for name in ("kp", "ki", "kd"))
-        self.driver.send(JointTargets(command["position"].astype(float), on, kp, ki, kd, command["torque_max"] * 1e-3))
-        state = self.driver.read()
+        targets = JointTargets(command["position"].astype(float), on, kp, ki, kd, command["torque_max"] * 1e-3)
+        try:
+            self.driver.send(targets)
+            state = self.driver.read()
+        except OSError:
+            self.counts.lost += 1
+            raise
         received = self._clock()
         if state is None:
             self.counts.silent += 1

@@ -156,35 +156,22 @@ class Frame:
         return body + crc16(body).to_bytes(2, "little")
 
 
-@dataclasses.dataclass
-class ParserCounts:
-    """Statistics of a parser."""
-
-    received: int = 0  # bytes
-    frames: int = 0  # accepted
-    crc_errors: int = 0  # valid headers with a wrong checksum
-    resyncs: int = 0  # number of times that bytes were skipped to find a frame
-    skipped: int = 0  # bytes outside of accepted frames
-    checked: int = 0  # bytes on which the checksum was computed
-
-
 class Parser:
     """Extracts frames from a damaged or truncated stream of bytes; memory is bounded by one frame and one chunk.
 
     A header is valid only with a known command and a length that this command can have, by `lengths`: `HAND_REPLIES` or
     `HOST_REQUESTS`. Then the checksum decides. When it fails, the search continues one byte after that header, so every
-    intact frame of the stream is found.
+    intact frame of the stream is found. `frames` and `crc_errors` count accepted frames, and valid headers with a wrong
+    checksum.
     """
 
     def __init__(self, lengths: Mapping[int, range]):
         self._lengths = {int(command): span for command, span in lengths.items()}
         self._buffer = bytearray()
-        self._searching = False  # between the last accepted frame and the next
-        self.counts = ParserCounts()
+        self.frames = self.crc_errors = 0
 
     def feed(self, data: bytes) -> list[Frame]:
         """Add received bytes; returns the frames that they complete."""
-        self.counts.received += len(data)
         self._buffer += data
         return self._scan(final=False)
 
@@ -198,7 +185,7 @@ class Parser:
         return len(self._buffer)
 
     def _scan(self, final: bool) -> list[Frame]:
-        buffer, frames, at, done = self._buffer, [], 0, 0
+        buffer, frames, at = self._buffer, [], 0
         while True:
             head = buffer.find(HEAD, at)
             if head < 0:
@@ -214,17 +201,14 @@ class Parser:
                     break
                 at += 1
             elif self._sound(at, end):
-                self._skip(at - done)
                 _, source, target, command, size = HEADER.unpack_from(buffer, at)
                 data = bytes(buffer[at + HEADER.size : at + HEADER.size + size])
                 frames.append(Frame(source, target, command, data))
-                self.counts.frames += 1
-                self._searching = False
-                at = done = end
+                self.frames += 1
+                at = end
             else:
-                self.counts.crc_errors += 1
+                self.crc_errors += 1
                 at += 1
-        self._skip(at - done)
         del buffer[:at]
         return frames
 
@@ -238,15 +222,8 @@ class Parser:
         return at + OVERHEAD + size if span is not None and size in span else None
 
     def _sound(self, at: int, end: int) -> bool:
-        self.counts.checked += end - at
         with memoryview(self._buffer) as view:
             return crc16(view[at : end - 2]) == int.from_bytes(view[end - 2 : end], "little")
-
-    def _skip(self, count: int) -> None:
-        if count:
-            self.counts.resyncs += not self._searching
-            self.counts.skipped += count
-            self._searching = True
 
 
 def command_block(

@@ -30,10 +30,10 @@ class Identity:
 
 def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
     """The identity in the contents of the two registers; None for one that the hand did not answer."""
-    text = _text(serial_number or b"")
+    text = printable(serial_number or b"")
     if side is None and not text:
         return Identity()
-    for word in (_text(side or b""), text[:4]):
+    for word in (printable(side or b""), text[:4]):
         if word.lower() in _WORDS:
             return Identity(text, _WORDS[word.lower()])
     return Identity(text, f"code {side[0]}" if side else "")
@@ -69,7 +69,7 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     return [f"warning: {note}" for note in notes]
 
 
-def _text(content: bytes) -> str:
-    """The printable text at the beginning of a register."""
+def printable(content: bytes) -> str:
+    """The text at the beginning of a register or an answer; empty for what is none."""
     text = content.split(b"\0")[0].decode("ascii", "replace").strip()
     return text if text.isprintable() and text.isascii() else ""

@@ -5,12 +5,15 @@
 """
 
 import dataclasses
+import time
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
 from dexsim.core.config import Config, Range, setting
 
+_PAUSE = 0.002  # s, of a call while the hand is gone
 BITS_PER_BYTE = 10  # 8N1
 _BASE = 1501000
 _NAMES = {
@@ -86,7 +89,6 @@ class LinkCounts:
     lost: int = 0  # the port failed
     late: int = 0  # answers that arrived after their deadline and were discarded
     crc_errors: int = 0
-    resyncs: int = 0
     reconnects: int = 0
 
 
@@ -121,6 +123,64 @@ class Reply:
     received: float  # s
     sequence: int  # number of this exchange since the port was created
     generation: int  # number of handshakes; it grows when the hand was disconnected
+
+
+class ReconnectingPort:
+    """What ports have in common: a line that fails is opened again, after waits that double at each attempt.
+
+    Args:
+      config: of the link; its `backoff` counts.
+      passive: the command that turns the motors off, until whose answer no other one is sent on a line that is new.
+      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
+      clock: s, in which replies are stamped; that of the exchange loop.
+    """
+
+    def __init__(
+        self,
+        config: LinkConfig,
+        passive: np.ndarray,
+        *,
+        tap: Callable[[str, bytes], None] | None = None,
+        clock: Callable[[], float] | None = None,
+    ):
+        self.config, self.counts = config, LinkCounts()
+        self.refusal: Refusal | None = None  # why the newest request was refused
+        self._tap = tap or (lambda direction, data: None)
+        self._clock, self._sleep = clock or time.monotonic, time.sleep
+        self._connected, self._returning, self._generation = False, False, 0
+        self._passive, self._retry_at, self._pause = passive, 0.0, config.backoff[0]
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        """See `HandPort.exchange`."""
+        self.refusal = None
+        try:
+            if not self._connected:
+                if self._clock() < self._retry_at:
+                    self._sleep(_PAUSE)
+                    return None
+                self._reopen()
+                self.counts.reconnects += 1
+                self._returning, self._pause = True, self.config.backoff[0]
+            reply = self._exchange(self._passive if self._returning else command)
+        except OSError:  # Base class of pyserial's errors.
+            self.close()
+            self._retry_at = self._clock() + self._pause
+            self._pause = min(2 * self._pause, self.config.backoff[1])
+            return None
+        self._returning &= reply is None
+        return reply
+
+    def close(self) -> None:
+        """Close the line. The motors keep doing what they were told last."""
+        raise NotImplementedError
+
+    def _exchange(self, command: np.ndarray) -> Reply | None:
+        """One exchange on an open line. OSError: the line failed."""
+        raise NotImplementedError
+
+    def _reopen(self) -> None:
+        """Open the line to the hand that was there before. OSError: it is still gone."""
+        raise NotImplementedError
 
 
 def refusal_of(port: "HandPort") -> Refusal | None:

@@ -6,7 +6,6 @@
 
 import contextlib
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,8 @@ from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
-from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
-from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Refusal, Reply, read_refusal
+from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, printable, read_identity
+from dexsim_real.wire.link import HandPort, LinkConfig, ReconnectingPort, Refusal, Reply, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -32,34 +31,28 @@ _REGISTER = 34  # bytes of the answer: number and content
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
 
-class SerialHand:
+class SerialHand(ReconnectingPort):
     """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
-    `refusal` says why the newest request was refused, None if it was not. `identity` is what the hand told about itself
+    `identity` is what the hand told about itself
     when it was connected. Another hand on the port is refused: it is told to turn its motors off, and nothing else.
-    `tap` is called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
+    `options` are those of `ReconnectingPort`.
     """
 
-    def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
-        self.port, self.config = port, config or LinkConfig()
-        self.counts = LinkCounts()
-        self.refusal: Refusal | None = None
-        self.identity = Identity()
-        self._tap = tap or (lambda direction, data: None)
+    def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
+        super().__init__(config or LinkConfig(), passive_command(), **options)
+        self.port, self.identity = port, Identity()
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
         self._others = self._early = 0  # frames of other hands; answers that came sooner than the baud rate allows
         self._owed = False  # whether the last request has not been answered yet
-        self._generation = 0
-        self._first: Reply | None = None
-        self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
     def connect(self) -> str:
         """Open the port and identify the hand; see `HandPort.connect`."""
         self._open()
         try:
-            time.sleep(self.config.settle)
+            self._sleep(self.config.settle)
             version = self._greet(self.config.handshake)
             self.identity = self._read_identity()
         except HandError:
@@ -70,20 +63,9 @@ class SerialHand:
             raise HandError(f"{self.port}: the connection failed in the handshake ({error}); check the cable") from None
         return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
-    def exchange(self, command: np.ndarray) -> Reply | None:
-        self.refusal = None
-        if self._serial is None:
-            return self._reconnect()
-        try:
-            return self._exchange(command)
-        except OSError:  # Base class of pyserial's errors.
-            self.close()
-            self._pause = self.config.backoff[0]
-            self._retry_at = time.monotonic() + self._pause
-            return None
-
     def close(self) -> None:
-        """Close the port. The hand keeps the mode that it was commanded last."""
+        """See `ReconnectingPort.close`."""
+        self._connected = False
         if self._serial is not None:
             with contextlib.suppress(OSError):
                 self._serial.close()
@@ -112,7 +94,7 @@ class SerialHand:
             self.counts.answered -= 1
             self.counts.corrupt += 1
             return None
-        return Reply(state, sent, time.monotonic(), self.counts.sent, self._generation)
+        return Reply(state, sent, self._clock(), self.counts.sent, self._generation)
 
     def _request(self, command: Command, data: bytes, reply: int) -> tuple[Frame | None, float]:
         """Send a command; its answer and the time s of sending."""
@@ -122,15 +104,14 @@ class SerialHand:
         try:
             self._discard()
             self._tap("tx", request)
-            sent, before = time.monotonic(), self._received
+            sent, before = self._clock(), self._received
             self._serial.write(request)
             answer = self._wait(command, sent, len(request), frames.OVERHEAD + reply)
         except OSError:
             self.counts.lost += 1
             raise
         finally:
-            self.counts.crc_errors = self._parser.counts.crc_errors
-            self.counts.resyncs = self._parser.counts.resyncs
+            self.counts.crc_errors = self._parser.crc_errors
         if answer is None:
             self.counts.corrupt += self._received > before
             self.counts.silent += self._received == before
@@ -147,7 +128,7 @@ class SerialHand:
         deadline = sent + self.config.deadline(request, reply)
         answer, final, heard = None, False, sent
         while answer is None and not final:
-            data, now = self._read(), time.monotonic()
+            data, now = self._read(), self._clock()
             heard = now if data else heard
             final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
             for frame in self._answers(self._parser.feed(data) + (self._parser.expire() if final else [])):
@@ -173,8 +154,8 @@ class SerialHand:
 
     def _discard(self) -> None:
         """Discard late answers to their last byte, so that none is mistaken for the next answer."""
-        late, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
-        while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
+        late, until = [], self._clock() + self.config.on_wire(_LONGEST) + _QUIET
+        while (self._serial.in_waiting or self._parser.pending) and self._clock() < until:
             late += self._parser.feed(self._read())
         late += self._parser.expire()
         self.counts.late += len(self._answers(late))
@@ -209,23 +190,20 @@ class SerialHand:
             # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
             with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
                 self._serial.set_low_latency_mode(True)
-        self._parser = frames.Parser(frames.HAND_REPLIES)
-        self._parser.counts.crc_errors = self.counts.crc_errors
-        self._parser.counts.resyncs = self.counts.resyncs
-        self._received = 0
+        self._parser.expire()
+        self._received, self._connected = 0, True
 
     def _greet(self, patience: float) -> str:
         """Handshake: ask for the version and one state with the motors off. The version may stay unknown."""
-        until, version = time.monotonic() + patience, "unknown"
+        until, version = self._clock() + patience, "unknown"
         self._generation += 1
         while True:
             frame, _ = self._request(Command.VERSION, b"", 64)
             if frame is not None:
-                version = _printable(frame.data)
-            self._first = self._exchange(passive_command())
-            if self._first is not None:
+                version = printable(frame.data) or frame.data.hex(" ")
+            if self._exchange(passive_command()) is not None:
                 return version
-            if time.monotonic() > until:
+            if self._clock() > until:
                 raise HandError(self._silence())
 
     def _read_identity(self) -> Identity:
@@ -262,7 +240,7 @@ class SerialHand:
             why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
         elif self.refusal is not None:
             why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
-        elif not self._parser.counts.frames and not self._parser.counts.crc_errors:
+        elif not self._parser.frames and not self._parser.crc_errors:
             why = f"no bytes belong to a frame; set --link.baud to that of the hand (now {config.baud} baud)"
         else:
             why = (
@@ -271,21 +249,13 @@ class SerialHand:
             )
         return f"{self.port}: {why}"
 
-    def _reconnect(self) -> Reply | None:
-        if time.monotonic() < self._retry_at:
-            time.sleep(_POLL)
-            return None
+    def _reopen(self) -> None:
         try:
             self._open()
             self._greet(0.0)
             self._recognise()
-        except (HandError, OSError):
-            self.close()
-            self._pause = min(2 * self._pause, self.config.backoff[1])
-            self._retry_at = time.monotonic() + self._pause
-            return None
-        self.counts.reconnects += 1
-        return self._first
+        except HandError as error:
+            raise OSError from error
 
 
 def check_wire(hand: Hand) -> None:
@@ -310,8 +280,3 @@ def open_port(spec: str, hand: Hand, config: LinkConfig, tap: Callable[[str, byt
     form = "sdk:MODULE:FUNCTION of an importable module"
     driver = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(hand, config)
     return DriverPort(driver, hand, config, tap=tap)
-
-
-def _printable(data: bytes) -> str:
-    text = data.rstrip(b"\x00").decode("ascii", "replace")
-    return text if text.isprintable() and text else data.hex(" ")

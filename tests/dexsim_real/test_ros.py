@@ -7,12 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy_stand_in
-from untrained import untrained
 
 from dexsim import load_hand
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real import ros
-from dexsim_real.core.errors import HandError
 from dexsim_real.wire.driver import DriverState
 
 STEP = 0.012  # s
@@ -57,9 +55,9 @@ def leap():
 def make(monkeypatch, leap):
     """A node over a driver, whose exchange loop the test turns in its own time."""
 
-    def make(driver, policy="", options="--no-guard"):
+    def make(driver, options="--no-guard"):
         monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
-        given = {"port": "sdk:my_sdk", "hand": "leap_like", "policy": str(policy), "options": options}
+        given = {"port": "sdk:my_sdk", "hand": "leap_like", "options": options}
         node = rclpy_stand_in.Node("dexsim_hand", **given)
         rclpy_stand_in.install(monkeypatch, node, lambda node: None)
         now = [0.0]
@@ -138,21 +136,14 @@ def test_a_hand_without_taxels_or_currents_publishes_what_it_has(make, leap):
     assert any("no taxels" in line for line in node.said) and any("no currents" in line for line in node.said)
 
 
-def test_a_policy_gives_the_targets_once_the_motors_are_on(make, leap, tmp_path):
+def test_the_service_turns_the_motors_off_for_good(make, leap):
     driver = Follower(leap)
-    untrained(leap, tmp_path / "policy.msgpack")
-    node, hand, turn = make(driver, tmp_path / "policy.msgpack", "--no-guard --approach 0.5")
-    assert "~/commands" not in node.subscriptions
+    node, _, turn = make(driver)
     turn(20)
-    assert hand.policy.ticks == 0
-    node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
-    turn(150)
-    assert hand.policy.ticks > 50 and driver.on and not hand.safety.latched
-    node.services["~/motors"](SimpleNamespace(data=False), SimpleNamespace())
-    turn(2)
-    assert not driver.on
-    with pytest.raises(HandError, match="observes 'contact_force', and the hand has no taxels"):
-        make(Follower(leap, ["currents"]), tmp_path / "policy.msgpack")
+    for data in (True, False):
+        node.services["~/motors"](SimpleNamespace(data=data), SimpleNamespace())
+        turn(2)
+        assert driver.on == data
 
 
 @pytest.mark.parametrize("way", [KeyboardInterrupt, RuntimeError])

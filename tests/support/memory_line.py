@@ -57,4 +57,4 @@ class MemoryLine:
 def connect(monkeypatch, peer, clock=time):
     """Every port that opens from now on is a line to this hand, and the driver's clock is this one."""
     monkeypatch.setattr("serial.serial_for_url", lambda url, timeout, **_: MemoryLine(peer, timeout, clock))
-    monkeypatch.setattr("dexsim_real.wire.serial_hand.time", clock)
+    monkeypatch.setattr("dexsim_real.wire.link.time", clock)

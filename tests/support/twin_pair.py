@@ -123,7 +123,7 @@ class Pair(Cable):
 
         super().__init__(faults, seed)
         clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.wait)
-        monkeypatch.setattr("dexsim_real.wire.serial_hand.time", clock)
+        monkeypatch.setattr("dexsim_real.wire.link.time", clock)
         monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(self, timeout))
         self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1)))
         self.port.connect()

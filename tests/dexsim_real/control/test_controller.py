@@ -190,7 +190,7 @@ def test_an_action_that_is_not_finite_counts_as_none(hand):
         [
             np.zeros(12, np.float32),
             np.full(12, 0.5, np.float32),
-            np.full(12, np.nan, np.float32),
+            np.where(np.arange(12) == 7, np.nan, 0.5).astype(np.float32),
             np.full(12, 3.0, np.float32),
         ]
     )
@@ -220,6 +220,8 @@ def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_
             (controller.start if number == 3 else controller.resume)(measured.joint_position)
         if number == 5:
             controller.anchor(measured.joint_position)  # with the motors off, at every tick
+        if number in (3, 5, 6):
+            np.testing.assert_array_equal(controller.target, measured.joint_position)
         tick = controller.tick(measured, seen, IDENTITY, 0.5)
         carry, action = policy.act(carry, tick.observation)
         np.testing.assert_array_equal(tick.action, action)

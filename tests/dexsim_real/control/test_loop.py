@@ -78,6 +78,11 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on(loop):
     assert not loop.driven
     run(loop, 1)
     assert loop.driven and Mode.POSITION not in loop.port.modes
+    run(loop, 5)
+    assert loop.driven and loop.port.modes[-1] == Mode.POSITION
+    loop.safety.relax("enough")
+    run(loop, 1)
+    assert not loop.driven
     loop.stop()
     assert not loop.driven and loop.port.modes[-1] == Mode.PASSIVE
 

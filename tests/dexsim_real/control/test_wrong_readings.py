@@ -46,12 +46,34 @@ def test_a_wrong_angle_moves_nothing(bench, value, cycles, hold):
     assert bench.safety.counts["implausible: measurement"] == cycles
 
 
+def test_the_first_reading_after_the_motors_came_on_may_be_wrong_as_well(hand):
+    bench = Bench(hand)
+    bench.engage()
+    assert bench.cycle().mode == Mode.POSITION
+    bench.position = wrong(4, 1.5)
+    bench.cycle(follow=False)
+    assert "index_joint1 reads 1.5 rad" in bench.safety.problem
+
+
 def test_wrong_angles_that_last_turn_the_motors_off_and_name_the_joint(bench):
     bench.position = wrong(4, 1.9)
     decisions = bench.run(1.2, target=MIDDLE, follow=False)
     assert decisions[-1].mode == Mode.PASSIVE
     assert all(np.array_equal(d.position, MIDDLE) for d in decisions if d.mode == Mode.POSITION)
     assert "implausible" in bench.safety.latched and "index_joint1 reads 1.9 rad" in bench.safety.latched
+
+
+@pytest.mark.parametrize("right", [2, 4, 40])
+def test_right_readings_between_wrong_ones_do_not_hide_them(bench, right):
+    """One right reading of so many: commands would follow it, and nothing would tell."""
+    start = bench.now
+    for k in range(round(6.0 / CYCLE)):
+        bench.position = MIDDLE if k % right == 0 else wrong(4, 1.9)
+        bench.cycle(target=MIDDLE, follow=False)
+        if bench.safety.latched:
+            break
+    assert bool(bench.safety.latched) == (right > 2)
+    assert right == 2 or "joint index_joint1 reads 1.9 rad" in bench.safety.latched and bench.now - start < 4.5
 
 
 def test_wrong_readings_far_apart_do_not_add_up(bench):
@@ -256,7 +278,7 @@ def test_a_command_that_is_not_finite_never_leaves(hand):
     sensing = HandSensing(hand, HardwareConfig())
     for bad in (np.nan, np.inf, 1e300):
         with pytest.raises(HandError, match="not finite"), np.errstate(over="ignore"):
-            sensing.command(np.full(12, bad), Mode.POSITION)
+            sensing.command(np.where(np.arange(12) == 7, bad, 0.5), Mode.POSITION)
 
 
 @settings(max_examples=10, deadline=None)

@@ -1,6 +1,5 @@
 """The log: what goes in comes out, whatever happens to the program or to the file."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -89,23 +88,6 @@ def test_files_that_are_no_log(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(LogError, match="cannot be written"):
         LogWriter(tmp_path / "file")  # A log is never overwritten.
-
-
-def test_a_full_disk_ends_the_log_and_not_the_run(tmp_path, monkeypatch):
-    log = LogWriter(tmp_path / "run.log")
-    real = os.write
-
-    def full(file, data):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "write", full)
-    log.add(Kind.NOTE, "lost")
-    while not log.failure:
-        time.sleep(0.01)
-    log.add(Kind.NOTE, "lost too")
-    monkeypatch.setattr(os, "write", real)
-    log.close()
-    assert "No space left" in log.failure and log.dropped == 2
 
 
 def test_a_record_that_cannot_be_written_is_counted_and_costs_no_other(tmp_path):

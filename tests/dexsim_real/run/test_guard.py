@@ -61,6 +61,10 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
             watched.beat()
             watched.check()
             time.sleep(0.02)
+        until = time.monotonic() + 20
+        while watched._asked is not None and time.monotonic() < until:
+            watched.check()
+        assert watched._asked is None, "it answers"
         os.kill(watched._process.pid, signal.SIGSTOP)
         monkeypatch.setattr(guard, "_ANSWER", patience)
         begin = time.monotonic()

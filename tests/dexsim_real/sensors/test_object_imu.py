@@ -28,6 +28,11 @@ def quat_of(yaw, pitch, roll):
     return quat
 
 
+def heading(angle):
+    """The orientation after a turn about the vertical, rad."""
+    return np.array([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])
+
+
 def apart(a, b):
     """Angle between two orientations, rad, by their matrices."""
     a, b = (np.asarray(rotations.quat_to_matrix(np.asarray(q, np.float32))) for q in (a, b))
@@ -105,6 +110,39 @@ def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():
     assert apart(reader.read()[1], quat_of(0, 0, 0)) == pytest.approx(math.radians(54), abs=2e-3)
     reader.receive(2.01, imu.encode(201, quat_of(50, 0, 0)))
     assert not objects.lost(2.01, 0.3), "it has come back"
+
+
+@pytest.mark.parametrize("angle", [20, 25, 60, 90, 180])
+@pytest.mark.parametrize("burst", [False, True])
+def test_an_orientation_that_jumps_and_stays_is_noticed_within_a_tenth_of_a_second(angle, burst):
+    """An IMU that has lost its reference; less than 0.4 rad in 10 ms is a motion. Also where samples come together."""
+    reader, objects = imu.ImuReader(), None
+    noticed = None
+    for tick in range(100):
+        time = 0.01 * (tick // 4 * 4 + 3 if burst else tick)
+        reader.receive(time, imu.encode(tick, heading(0.003 * tick + math.radians(angle) * (tick >= 40))))
+        if tick == 0:
+            reader.calibrate(IDENTITY)
+            objects = ObjectSensors(np.zeros(3), None, reader)
+        if noticed is None and objects.lost(0.01 * tick, 0.3):
+            noticed = tick
+    assert noticed == (44 if angle > 23 else None)
+
+
+@given(st.lists(st.floats(-15.0, 15.0), min_size=20, max_size=60), st.sampled_from([0, 5, 17]), st.integers(1, 4))
+def test_a_fast_object_and_lost_frames_are_no_jump(speeds, lost, together):
+    """Up to 15 rad/s, up to 0.1 s without a frame, one by one or together; nor does the quaternion's sign jump."""
+    reader, angle = imu.ImuReader(), 3.0
+    for tick, speed in enumerate(speeds):
+        angle += 0.01 * speed
+        if not (lost and lost <= tick < lost + 9):
+            time = 0.01 * (tick - tick % together)
+            reader.receive(time, imu.encode(tick, heading(angle)))
+        if tick == 0:
+            reader.calibrate(IDENTITY)
+            before = reader.read()[1]
+        assert not reader.jumped and reader.read()[1] @ before > 0.5
+        before = reader.read()[1]
 
 
 def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():

@@ -145,7 +145,7 @@ class WarmingHand:
         return state(np.clip(np.round(shown / 0.1), 0, 255))
 
 
-@pytest.mark.parametrize(("held", "free"), [(120.0, 12.0)])
+@pytest.mark.parametrize(("held", "free"), [(120.0, 12.0), (8.0, 4.0)])
 def test_half_an_hour_of_warming_leaves_next_to_nothing(hand, held, free):
     """Holding 8 N in between: what is held must neither be followed nor stop all following."""
     warming, sensing = WarmingHand(hand), HandSensing(hand, HardwareConfig())

@@ -113,7 +113,7 @@ def test_a_state_arrives_in_si_units_and_a_command_leaves_in_them(leap):
         ({"taxel_force": np.zeros((4, 47))}, r"taxel_force has the shape \[4, 47\]"),
         ({"taxel_force": None}, r"taxel_force has the shape \[\], expected \[4, 48\]"),
         ({"current": None}, "current has the shape"),
-        ({"temperature": np.full(16, np.nan)}, "temperature is not finite"),
+        ({"temperature": np.where(np.arange(16) == 3, np.nan, 30.0)}, "temperature is not finite"),
         ({"current": np.full(16, np.inf)}, "current is not finite"),
     ],
 )
@@ -126,17 +126,25 @@ def test_a_state_that_does_not_keep_the_promise_is_refused(leap, values, says):
 
 
 def test_a_line_that_fails_is_connected_again_with_the_motors_off(leap):
-    driver = Scripted(leap)
-    port = opened(leap, driver)
+    driver, now = Scripted(leap), [0.0]
+    port = opened(leap, driver, clock=lambda: now[0])
     on = HandSensing(leap, HardwareConfig()).command(np.zeros(16), Mode.POSITION)
     assert port.exchange(on).generation == 1
     driver.failing = True
-    assert [port.exchange(on) for _ in range(5)] == [None] * 5 and port.counts.lost == 1
-    driver.failing = False
+    for time, attempts in ((0.0, 1), (0.0009, 1), (0.0011, 2), (0.003, 2), (0.0032, 3), (0.005, 3), (0.0053, 4)):
+        now[0] = time  # Waits of 1 ms, then of 2 ms.
+        assert port.exchange(on) is None and driver.calls.count("connect") == attempts
+    assert port.counts.lost == 1
+    now[0], driver.failing = 1.0, False
+    driver.sent.clear()
+    driver.read, read = lambda: None, driver.read
+    while len(driver.sent) < 5:  # It is back, and does not answer yet.
+        assert port.exchange(on) is None
+    driver.read = read
     while (reply := port.exchange(on)) is None:
         pass
-    assert reply.generation == 2 and not driver.sent[-1].on and port.counts.reconnects == 1
-    assert driver.calls.count("connect") > 1
+    assert not any(targets.on for targets in driver.sent)
+    assert reply.generation == 2 and port.counts.reconnects == 1
     assert port.exchange(on).generation == 2 and driver.sent[-1].on
 
 

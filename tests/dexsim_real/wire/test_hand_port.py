@@ -14,7 +14,7 @@ from dexsim import load_hand
 from dexsim_real.core.errors import HandError, explain
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.wire.frames import Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig, Refusal, greet, refusal_of
+from dexsim_real.wire.link import LinkConfig
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 serial = pytest.importorskip("serial")
@@ -85,17 +85,6 @@ def test_a_port_that_does_not_open_is_one_line(monkeypatch, error):
     monkeypatch.setattr(serial, "Serial", fail)
     with pytest.raises(HandError, match="^/dev/imu: cannot be opened"):
         Imu("/dev/imu")
-
-
-def test_what_a_port_may_tell():
-    class Driver:
-        def connect(self):
-            return "a hand"
-
-    driver, busy = Driver(), Refusal("busy", serious=False)
-    assert greet(driver) == ["a hand"] and refusal_of(driver) is None
-    driver.warnings, driver.refusal = lambda: ["slow"], busy
-    assert greet(driver) == ["a hand", "warning: slow"] and refusal_of(driver) is busy
 
 
 def test_the_latency_timer(tmp_path):
