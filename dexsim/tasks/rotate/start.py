@@ -31,7 +31,7 @@ from dexsim.tasks.placement import clearance, close_fingers, palm_height
 from dexsim.tasks.rotate.objects import CLEARANCE, largest_size, lowest_point, sample_turned_object, slots
 
 _TRIALS = 300  # rounds of candidates in which every object should find a posture
-_VERSION = 4  # of the procedure: raise it when older pools no longer hold
+_VERSION = 5  # of the procedure: raise it when older pools no longer hold
 _SETTLING = 0.8  # s, for start states to come to rest; those that do not are discarded
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _HEADING_NOISE = 0.7  # rad, largest turn of the object about the axis at the start
