@@ -16,6 +16,7 @@ UNKNOWN = "the pose is not known: the last readings disagree, or are too few"
 _BEYOND = 0.1  # rad beyond a joint's limits up to which an angle is plausible
 _AGREEING = 10  # newest readings of a pose; fewer than half of them may be wrong by as much as they may differ
 _APART = 0.05  # rad, largest distance of these readings from their median
+_STILL = 0.01  # rad, largest motion of their median from the older half of them to the newer: no drift is a pose
 _NOW = 5  # newest readings whose median is the pose of a hand that moves
 _FASTER = 1.25  # largest joint speed, relative to the no-load speed of the model
 _JUMP = 0.1  # rad, change that is always possible: noise, gear play, a push
@@ -37,11 +38,14 @@ class PoseCheck:
 
     @property
     def at_rest(self) -> np.ndarray | None:
-        """[J] rad, where motors that are off may come on: median of the last readings; None unless they agree."""
+        """[J] rad, where motors that are off may come on: median of the last readings; None unless they agree and stand
+        still."""
         if len(self._recent) < _AGREEING:
             return None
-        median = np.median(self._recent, axis=0)
-        return median if np.abs(np.array(self._recent) - median).max() <= _APART else None
+        readings = np.array(self._recent)
+        median, older, newer = (np.median(part, axis=0) for part in (readings, readings[:_NOW], readings[_NOW:]))
+        apart, moved = np.abs(readings - median).max(), np.abs(newer - older).max()
+        return median if apart <= _APART and moved <= _STILL else None
 
     @property
     def newest(self) -> np.ndarray | None:

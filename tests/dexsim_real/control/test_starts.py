@@ -11,6 +11,7 @@ import pytest
 from test_safety import CYCLE, FREE, MIDDLE, sample
 
 from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.pose_check import PoseCheck
 from dexsim_real.control.safety import Safety
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.twin.plant.drives import PERIOD, Drives
@@ -165,3 +166,12 @@ def test_a_pose_that_is_wrong_throughout_is_crept_to(hand, way):
     for size, most in ((0.1, SLOW), (0.3, 1.5)):
         fastest, on = starts(hand, [lambda rng, e=way * size: lambda k, past: past[-1] + e * (np.arange(12) == 6)] * 3)
         assert on.all() and fastest[1:].max() <= most
+
+
+@pytest.mark.parametrize(("rate", "known"), [(0.0, True), (0.1, True), (0.25, False), (-0.9, False)])
+def test_readings_that_drift_are_no_pose(hand, rate, known):
+    """Ten readings of 0.9 rad/s are within 0.05 rad of their median, and may be as far from the true angle."""
+    check = PoseCheck(hand)
+    for k in range(20):
+        check.judge(k * CYCLE, MIDDLE + rate * k * CYCLE * (np.arange(12) == 9), None)
+    assert (check.at_rest is not None) == known
