@@ -1,7 +1,7 @@
 """Training defaults per device: sizes and durations."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 
@@ -86,7 +86,7 @@ def find_preset(name: str, task: str) -> Preset:
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
-        memory = "gru" if task in _FROM_MEMORY else "none"
+        memory: Literal["none", "gru"] = "gru" if task in _FROM_MEMORY else "none"
         return replace(preset, ppo=replace(ppo, num_envs=16384, memory=memory), minutes=5.0)
     curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
