@@ -28,7 +28,10 @@ EXPECTED = {
     "motors": (3, [r"12 joints pressed, torque at 0\.3 A off by [0-5]\.\d %", "2 sub-steps of 5 ms"]),
     "hand_bridge": (
         1,
-        ["1 frame after noise and in two pieces, 0 with", r"(\d+) ticks from \d+ frames: \1 readings and \1 "],
+        [
+            "1 frame after noise and in two pieces\n0 with a flipped bit: 1 wrong",
+            r"(\d+) ticks from \d+ frames: \1 readings and \1 ",
+        ],
     ),
     "own_hand": (
         4,

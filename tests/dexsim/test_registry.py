@@ -32,7 +32,7 @@ def test_a_registered_task_is_made_by_name_with_its_annotated_configuration(hand
     dexsim.register("mine", Mine)
     task = registry.make_task("mine", hand)
     assert isinstance(task, Mine)
-    assert task.config == dataclasses.replace(GraspConfig(), posture=hand.grasp_posture)
+    assert task.config == dataclasses.replace(GraspConfig(), posture=hand.grasp_posture, finger_force=(1.2, 4.8))
     assert registry.find_task("mine").config_class is GraspConfig
 
 

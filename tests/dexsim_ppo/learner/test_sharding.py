@@ -62,8 +62,8 @@ def test_two_devices_train_as_one(tmp_path):
     ("changes", "devices", "processes", "message"),
     [
         ({"num_envs": 12, "minibatches": 16, "memory": "none"}, 4, 1, "PPOConfig.minibatches = 16: leaves 6 rows each"),
-        ({}, 5, 1, "TrainArguments.devices = 5: there are 4, in 1 processes"),
-        ({}, 2, 2, "devices = 2: there are 4, in 2 processes"),  # one without a device would wait for ever
+        ({}, 5, 1, "TrainArguments.devices = 5: expected at most 4 in 1 processes"),
+        ({}, 2, 2, "devices = 2: expected at most 4 in 2 processes"),  # one without a device would wait for ever
     ],
 )
 def test_every_device_gets_as_many_environments_and_rows(changes, devices, processes, message, monkeypatch):
