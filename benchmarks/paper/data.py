@@ -14,6 +14,7 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim_ppo.policy import load_policy
+from dexsim_real.twin.plant.parameters import skill_of
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORTS = ROOT / "docs" / "results"
@@ -114,7 +115,7 @@ class Row:
     @property
     def skill(self) -> str:
         """grasp or rotate."""
-        return self.task.partition("_")[0]
+        return skill_of(self.task)
 
 
 Measure = Callable[[Row, int, Budget, Path], dict[str, Any]]

@@ -117,20 +117,18 @@ _READINGS = (
 )
 
 _ORIENTATIONS = {
-    "exact": ("sensing.orientation.bias=0", "sensing.orientation.noise=0", "sensing.orientation.drift=0"),
-    "0.1 rad": ("sensing.orientation.bias=0.1",),
-    "0.3 rad": ("sensing.orientation.bias=0.3",),
-    "none": (),
+    "exact": (0.0, ("sensing.orientation.bias=0", "sensing.orientation.noise=0", "sensing.orientation.drift=0")),
+    "0.1 rad": (0.1, ("sensing.orientation.bias=0.1",)),
+    "0.3 rad": (0.3, ("sensing.orientation.bias=0.3",)),
+    "none": (0.0, ()),
 }
+"""Error of the emulated hand's orientation [rad], and training's settings."""
 _OBJECTS = {
     "cube": ("edge=[0.055,0.055]",),
     "sizes": ("edge=[0.045,0.065]",),
     "shapes": ('objects.shapes=["box","cylinder"]', "edge=[0.045,0.065]", "proportions=[0.9,1.1]"),
 }
-_ROUGH = (
-    *("push_probability=0.01", "push_speed=0.2"),
-    *("objects.friction=[0.1,1.6]", "objects.link_friction=[0.1,1.2]"),
-)
+_ROUGH = ("push_probability=0.01", "push_speed=0.2", "objects.friction=[0.1,1.6]", "objects.link_friction=[0.1,1.2]")
 
 
 def _map_rows() -> Iterator[Row]:
@@ -139,13 +137,13 @@ def _map_rows() -> Iterator[Row]:
         left_out = [] if touch else ["contact_force", "contact_centre"]
         left_out += ["relative_orientation"] if orientation == "none" else []
         world = f"{orientation}, {object}, {'rough' if rough else 'as trained'}"
-        error = float(orientation[:3]) if orientation[0] == "0" else 0.0
+        error, sensing = _ORIENTATIONS[orientation]
         yield Row(
             name=f"{world}, {'touch' if touch else 'no touch'}".replace(" ", "_").replace(",", ""),
             label=world,
             task="rotate",
             settings=(
-                *_ORIENTATIONS[orientation],
+                *sensing,
                 *_OBJECTS[object],
                 *(_ROUGH if rough else ()),
                 f"observation.leave_out={json.dumps(left_out)}",
@@ -200,7 +198,7 @@ _ALL = (
         name="touch_map",
         title="Where touch pays: rotation with and without it",
         rows=tuple(_map_rows()),
-        measure=measure.mapped,
+        measure=measure.trained,
         table=tables.touch_map,
         draw=figures.touch_map,
         training_seeds=3,

@@ -14,6 +14,7 @@ from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
+from dexsim_real.twin.plant.parameters import skill_of
 from paper.data import BUDGETS, ROOT, Budget, Measure, Row
 
 HELD_OUT_POOL = 480
@@ -52,27 +53,18 @@ def measured(*worlds: str) -> Measure:
     return measure
 
 
-def mapped(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """Train a seed of a row; then simulation, the emulated hand and a foreign plant, in the row's world."""
-    file, training = train(row, seed, budget, work) if budget.training else (row.skill, None)
-    task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.task
-    given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
-    return {
-        "training": training,
-        "simulation": simulate(
-            load_policy(file), (), budget.episodes[row.skill], budget.seconds.get(row.skill), budget
-        ),
-        "hand": trials(task, str(file), seed, budget.name, given),
-        "foreign": trials(task, str(file), seed, budget.name, given, FOREIGN),
-    }
-
-
 def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
+    """Simulation and the emulated hand; of a row that says what the hand draws, a foreign plant as well."""
     count, seconds = budget.episodes[row.skill], budget.seconds.get(row.skill)
-    return {
+    task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.skill
+    given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
+    report = {
         "simulation": simulate(load_policy(policy), (), count, seconds, budget),
-        "hand": trials(row.skill, policy, seed, budget.name),
+        "hand": trials(task, policy, seed, budget.name, given),
     }
+    if row.plant:
+        report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
+    return report
 
 
 def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -183,7 +175,7 @@ def trials(
     that are `given`."""
     import zero_shot
 
-    budget, skill = BUDGETS[budget_name], task.partition("_")[0]
+    budget, skill = BUDGETS[budget_name], skill_of(task)
     options = {
         "task": task,
         "policy": policy,

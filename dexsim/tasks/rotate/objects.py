@@ -11,7 +11,7 @@ from dexsim.core.pytree import Array
 from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.geometry import rotations
 from dexsim.objects.config import INACTIVE_SIZE, SHAPES
-from dexsim.objects.params import ObjectParams, extent, sample_object
+from dexsim.objects.params import ObjectParams, extent, sample_object, unit_inertia
 
 _Z_TO_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 CLEARANCE = 0.001  # m, smallest gap between palm and object with support "fingers"
@@ -71,13 +71,10 @@ def upright(axis: np.ndarray) -> np.ndarray | None:
 
 def solid_inertia(object: ObjectParams) -> jax.Array:
     """Inertia [3] m^2 about its axes of a uniform box, or cylinder along x, of 1 kg."""
-    squares = object.size**2
-    inertia = jnp.zeros(3)
-    for kind, (a, b, c), active in zip(object.kinds, squares, object.active, strict=True):
-        box = jnp.stack([b + c, a + c, a + b]) / 3
-        side = a / 4 + b / 3
-        inertia += jnp.where(active, box if kind == "box" else jnp.stack([a / 2, side, side]), 0.0)
-    return inertia
+    inertia = unit_inertia(object)  # of a cylinder along z
+    if "cylinder" not in object.kinds:
+        return inertia
+    return jnp.where(object.active[object.kinds.index("cylinder")], inertia[::-1], inertia)
 
 
 def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Array:
