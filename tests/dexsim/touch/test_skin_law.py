@@ -30,6 +30,7 @@ def hold(hand, start, rng, law):
     """[(qpos, force on the fingers [5] N)] of the levels at which it held."""
     exact = bool(start.object.active[SLOTS.index("cylinder")])
     model = c_scene.compile_scene(hand, start.object, exact=exact, iterations=20, line_search=30)
+    model.opt.timestep = 0.006  # s; the motors below are explicit, and chatter at the 10 ms of implicit ones
     data = c_scene.start(model, start.qpos, 0 * start.qvel)
     known = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start.object)
     close = rng.uniform(0.5, 1.0, 12) * (np.arange(12) > 3)
