@@ -30,7 +30,7 @@ from dexsim_real.wire.link import Refusal
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
 _FORCE = "the fingertip force is too high"
 _GAP = 0.03  # s, longest interval between two commands that counts for the speed limit
-_SOFT = 0.5  # s, in which stiffness and speed grow when the motors come on: a joint whose pose was wrong creeps there
+_SOFT = 0.5  # s, in which stiffness grows when the motors come on: a joint whose pose was wrong creeps there
 _LONGEST = 5.0  # s of holding after which the motors go off: a policy that is held does not let go of what it squeezes
 _RECOVERY = 0.25  # s of holding that are forgiven per s without: short holds may take a fifth of the time for ever
 _EASE = 0.1  # rad, 1 cm at a fingertip: farther, easing after a joint that reads too high would lead it to its stop
@@ -279,7 +279,8 @@ class Safety:
             np.minimum(measured - config.reach, self.commanded),
             np.maximum(measured + config.reach, self.commanded),
         )
-        speed = self._soft(now) * self._slow + grown * (config.speed - self._slow)
+        # A command that moved ahead of soft motors would stick by friction, then catch up faster than itself.
+        speed = self._slow + grown * (config.speed - self._slow) if self._soft(now) >= 1 else 0.0
         position = self._toward(now, self._inside(np.clip(target, *near)), speed)
         # Policies rest joints at their stops: the margin alone is no event.
         clipped = np.abs(position - self._inside(target)), np.abs(target - np.clip(target, *self._stops))
@@ -294,7 +295,7 @@ class Safety:
         return np.clip(goal, self.commanded - step, self.commanded + step).astype(np.float32)
 
     def _soft(self, now: float) -> float:
-        """Share of the stiffness, and of the speed of starts, after the motors came on."""
+        """Share of the stiffness after the motors came on."""
         return min(max((now - self._on) / _SOFT, 0.0), 1.0)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:

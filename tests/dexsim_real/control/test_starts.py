@@ -1,7 +1,7 @@
 """Starts with wrong readings, judged by the true angles: motors that come on move no joint faster than `slow_speed`.
 
-Hundreds of hands at once have the motors of the emulated hand, without friction, which would hide a motion. Each has a
-`Safety` of its own and is read at 83 Hz. The first readings after the connection, or after a reconnection, are wrong.
+Hundreds of hands at once have the motors of the emulated hand, without friction, which would hide a motion, unless a
+test asks for it. Each has a `Safety` of its own and is read at 83 Hz. The first readings after the connection, or after a reconnection, are wrong.
 """
 
 from types import SimpleNamespace
@@ -27,13 +27,14 @@ BEFORE, READ = 14, 45  # cycles until the connection is lost, and of wrong and r
 class Hands:
     """The joints [H, 12] of many hands, moved by the drives of the emulated one."""
 
-    def __init__(self, hand, count):
+    def __init__(self, hand, count, friction=0.0):
         self.angle = np.tile(MIDDLE.astype(float), (count, 1))
         self.speed, self.time = np.zeros_like(self.angle), 0.0
         self.fastest = np.zeros(count)  # rad/s, mean of a cycle, with the motors on
         self._inertia = np.tile(np.where(hand.torque_limit > STRONG, *ROTORS), count)
         self._drives = Drives(np.tile(hand.torque_limit, count), np.tile(hand.speed_limit, count))
-        nominal = sample_trial("rotate", np.random.default_rng(0), "nominal", {"thermal": 0.0, "no_load_current": 0.0})
+        fixed = {"thermal": 0.0, "no_load_current": 0.0, "coulomb_friction": friction}
+        nominal = sample_trial("rotate", np.random.default_rng(0), "nominal", fixed)
         self._drives.configure(
             SimpleNamespace(**{name: np.tile(v, count) if v.shape == (12,) else v for name, v in nominal.value.items()})
         )
@@ -47,8 +48,9 @@ class Hands:
         command = {"position": position.ravel(), "kp": kp, "ki": zero, "kd": zero, "torque_max": full, "mode": mode}
         self._drives.send(self.time, command)
         for _ in range(round(CYCLE / PERIOD)):
-            torque, _ = self._drives.step(self.time, self.angle.ravel(), self.speed.ravel())
-            self.speed = (self.speed.ravel() + PERIOD * torque / self._inertia).reshape(on.shape) * on
+            torque, dry = self._drives.step(self.time, self.angle.ravel(), self.speed.ravel())
+            speed, stopped = self.speed.ravel() + PERIOD * torque / self._inertia, PERIOD * dry / self._inertia
+            self.speed = (np.sign(speed) * np.maximum(np.abs(speed) - stopped, 0.0)).reshape(on.shape) * on
             self.angle = self.angle + PERIOD * self.speed
             self.time += PERIOD
         self.fastest = np.maximum(self.fastest, np.abs(self.angle - before).max(1) / CYCLE)
@@ -158,6 +160,17 @@ def test_no_start_moves_a_joint_faster_than_the_speed_of_starts(hand, count):
     assert on.mean() > 0.95
     worst = {kind.__name__: max(fastest[h] for h, k in enumerate(kinds) if k is kind) for kind in KINDS}
     assert fastest.max() <= SLOW * 1.001, worst
+
+
+def test_joints_that_stick_do_not_catch_up_while_they_stiffen(hand):
+    hands, safety, decision = Hands(hand, 1, friction=0.03), Safety(hand, SafetyConfig()), None
+    safety.engage()
+    while decision is None or decision.mode != Mode.POSITION or decision.stiffness < 1:
+        safety.update(sample(hands.time, hands.angle[0]))
+        safety.set_target(MIDDLE + np.float32(0.6), hands.time)
+        decision = safety.decide(hands.time)
+        hands.cycle(decision.position[None], np.array([decision.mode == Mode.POSITION]), [decision.stiffness])
+    assert 0 < hands.time < 2 and hands.fastest <= SLOW
 
 
 @pytest.mark.parametrize("way", [-1, 1])
