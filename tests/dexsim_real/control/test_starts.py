@@ -1,7 +1,8 @@
 """Starts with wrong readings, judged by the true angles: motors that come on move no joint faster than `slow_speed`.
 
 Hundreds of hands at once have the motors of the emulated hand, without friction, which would hide a motion, unless a
-test asks for it. Each has a `Safety` of its own and is read at 83 Hz. The first readings after the connection, or after a reconnection, are wrong.
+test asks for it. Each has a `Safety` of its own and is read at 83 Hz. The first readings after the connection, or
+after a reconnection, are wrong.
 """
 
 from types import SimpleNamespace
