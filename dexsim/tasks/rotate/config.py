@@ -108,9 +108,13 @@ class RotateConfig(EnvConfig):
     fingertips, beside which the first stroke often fails."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
     """Largest shift of the object from its start position."""
-    trap: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    trap: float = setting(0.25, unit="1", low=0.0, high=1.0)
     """Share of the start states in which the object is stuck: ahead of the reference, tipped toward the wrist and held
     by the middle finger. Above 0, tipping and moving ahead cost in every tick, too."""
+    observation: ObservationConfig = setting(ObservationConfig(add=("palm_gravity", "past_actions")))
+    """What the policy sees. Which way the palm leans tells where a cube slides."""
+    randomization: Randomization = setting(Randomization(latency=(0.0, 0.06)))
+    """Properties of the hand that are drawn anew in every episode."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
     """Reward weights. The gate closes before `turn.distance`."""
 
@@ -138,9 +142,14 @@ class RotateConfig(EnvConfig):
         )
 
 
+_PLAIN = RotateConfig(trap=0.0, observation=ObservationConfig(), randomization=Randomization())
+"""Without what is known to help `rotate` alone."""
+
+
 def paper() -> RotateConfig:
     """The paper's rewards, success test and observations. What the paper gives no number for: docs/equations.md."""
-    return RotateConfig(
+    return dataclasses.replace(
+        _PLAIN,
         turn=TurnSpec(),
         drop_distance=0.09,
         drop_tilt=math.pi,
@@ -157,13 +166,14 @@ def paper() -> RotateConfig:
 
 def without_orientation() -> RotateConfig:
     """The paper's second policy: the object's orientation is not observed."""
-    return RotateConfig(observation=ObservationConfig(leave_out=("relative_orientation",)))
+    return dataclasses.replace(_PLAIN, observation=ObservationConfig(leave_out=("relative_orientation",)))
 
 
 def any_object() -> RotateConfig:
     """Boxes and cylinders of unknown size, whose orientation is not observed, on a palm that leans as much as 0.4 rad
     either way from its nominal tilt."""
-    return RotateConfig(
+    return dataclasses.replace(
+        _PLAIN,
         objects=ObjectConfig(
             shapes=("box", "cylinder"), mass=(0.06, 0.15), friction=(0.4, 1.2), link_friction=(0.3, 0.9)
         ),
@@ -177,7 +187,8 @@ def any_object() -> RotateConfig:
 def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
     upright there."""
-    return RotateConfig(
+    return dataclasses.replace(
+        _PLAIN,
         reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04),
         support="fingers",
         tilt=-1.1,

@@ -280,10 +280,12 @@ class Rotate(Task):
     # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
-        """Rows [count] of the pool, evenly spread over it; goals that end with a drop only."""
+        """Rows [count], evenly spread over those of the pool that are not in the trap; goals that end with a drop only."""
         goal = dataclasses.replace(self.begin(None, None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
-        return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
+        size = self.config.pool_size  # of each of the pools that follow one another here
+        free = np.flatnonzero(np.arange(len(shape_index)) % size < size - round(self.config.trap * size))
+        return free[np.linspace(0, len(free) - 1, count).round().astype(int)], goals
 
     def summarize(self, metrics: dict[str, np.ndarray], episode_length: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.rotate.report`."""

@@ -224,6 +224,7 @@ def test_every_term_of_a_tick(weighted):
         "velocity": -0.1 * (4 + 16),
         "torque": -0.25 * (0.25 + 2.25),
         "drop": 0.0,
+        "trap": -((0.04 / 0.022) ** 2),
     }
     known = {f"reward/{name}": value for name, value in terms.items()} | {
         "goals_per_minute": 0.0,
@@ -301,6 +302,8 @@ def test_clocks_pushes_and_rows(hand):
     assert rows.tolist() == [0, 2, 4, 6, 8] and goals.turns.shape == (5,) and goals.duty.shape == (5, 5)
     assert not np.any(goals.gives_up) and bool(task.begin(key, None).gives_up)
     assert task.evaluation_plan(4, np.zeros(2, int))[0].tolist() == [0, 0, 1, 1]
+    two_pools = Rotate(RotateConfig(pool_size=8, trap=0.25), hand).evaluation_plan(12, np.zeros(16, int))[0]
+    assert two_pools.tolist() == [*range(6), *range(8, 14)], "none of the trap"
 
 
 class TestDrop:

@@ -135,7 +135,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         simulated = np.asarray(door(tick.readings, goal))
         assert simulated.dtype == tick.observation.dtype == np.float32
         assert simulated.tobytes() == tick.observation.tobytes()
-        assert len(simulated) == (66 if task.name == "grasp" else 65)
+        assert len(simulated) == (66 if task.name == "grasp" else 92)
 
 
 def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
@@ -149,7 +149,7 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
         control=Control(step=0.08),
     )
     task = StillRotate(config, hand)
-    weights = np.random.default_rng(0).normal(size=(65, 12)).astype(np.float32) * 0.3
+    weights = np.random.default_rng(0).normal(size=(92, 12)).astype(np.float32) * 0.3
 
     def act(observation):
         return jnp.tanh(jnp.asarray(observation) @ weights)
@@ -167,7 +167,9 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
         block = frames.empty_state()
         block["joint"]["position"] = readings.joint_position
         block["tip"]["taxel"]["z"] = np.round(np.asarray(readings.taxel_force) / 0.1)
-        seen = ObjectEstimate(readings.object_position, readings.object_velocity, readings.object_quat)
+        seen = ObjectEstimate(
+            readings.object_position, readings.object_velocity, readings.object_quat, readings.palm_gravity
+        )
         tick = controller.tick(sensing.measure(block), seen, readings.goal_quat, 0.0)
         # The action in the observation is the one that led to this measurement, not the one it leads to.
         np.testing.assert_array_equal(tick.observation[begin : begin + 12], actions[-1])
