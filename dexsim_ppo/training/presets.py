@@ -91,7 +91,8 @@ def find_preset(name: str, task: str) -> Preset:
         if task != "rotate_any":
             return preset
         # Its own ranges are wide enough to begin with: four times the goals after 120 million steps.
-        return replace(preset, extremes=0.0, ppo=replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150))
+        larger = replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150)
+        return replace(preset, extremes=0.0, ppo=larger)
     curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":

@@ -280,7 +280,7 @@ class Rotate(Task):
     # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
-        """Rows [count], evenly spread over those of the pool that are not in the trap; goals that end with a drop only."""
+        """Rows [count], evenly spread over those of the pool outside the trap; goals that end with a drop only."""
         goal = dataclasses.replace(self.begin(None, None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         size = self.config.pool_size  # of each of the pools that follow one another here
