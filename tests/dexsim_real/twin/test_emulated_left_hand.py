@@ -8,7 +8,6 @@ import pytest
 from dexsim.hand.load import load_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.control.controller import Controller
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
@@ -22,9 +21,9 @@ def left():
     return load_hand("xhand_left")
 
 
-def test_the_shipped_grasp_holds_on_the_left_hand(left):
+def test_the_shipped_grasp_holds_on_the_left_hand(left, controller_of):
     plant = EmulatedHand(left, "grasp", 0, kind="nominal", trials=1, seconds=2.0)
-    report = VirtualRun(plant, Controller(load_policy("grasp"), left), ideal_calibration(left)).run()
+    report = VirtualRun(plant, controller_of(load_policy("grasp"), left), ideal_calibration(left)).run()
     assert report["held"] and report["finger_force"] > 0.5 and report["bridge"]["latched"] == ""
 
 
