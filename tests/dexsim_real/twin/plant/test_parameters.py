@@ -52,9 +52,12 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     for config in (to_dict(TRAINED[task].config_class()), shipped):
         for name, band in trained_bands(task).items():
             trained = _lookup(config, band.origin)
-            if not isinstance(trained, (tuple, list)):
-                trained = (-trained if band.low < 0 else trained, trained)
-            assert (band.low, band.high) == pytest.approx(trained), name
+            low, high = (
+                trained
+                if isinstance(trained, (tuple, list))
+                else ((-trained, trained) if band.low < 0 else (trained, trained))
+            )
+            assert (band.low, band.high) == pytest.approx((low, high)), name
         assert PUSHES[task][1] == config["push_speed"]
         assert PUSHES[task][0] == pytest.approx(
             config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
