@@ -19,7 +19,7 @@ from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, Reply, refusal_of
+from dexsim_real.wire.link import HandPort, Reply
 
 TARE_SAMPLES = 30
 _TARE = 5.0  # s in which they must arrive
@@ -91,7 +91,7 @@ class ExchangeLoop:
     def take(self, decision: SafetyDecision, reply: Reply | None) -> Exchange | None:
         """Update with the answer to a request; None without one."""
         if reply is None:
-            self.safety.refuse(refusal_of(self.port))
+            self.safety.refuse(self.port.refusal)
             return None
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
@@ -112,7 +112,7 @@ class ExchangeLoop:
             exchange = self.cycle()
             if exchange is not None:
                 states.append(exchange.state)
-            elif (refusal := refusal_of(self.port)) and refusal.serious:
+            elif (refusal := self.port.refusal) and refusal.serious:
                 raise HandError(refusal.text)
         if len(states) < TARE_SAMPLES:
             raise HandError(f"only {len(states)} answers in {_TARE:g} s, cannot tare the taxels; check the cable")

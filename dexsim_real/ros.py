@@ -24,31 +24,22 @@ import numpy as np
 from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
-from dexsim.core.config import Config, setting
+from dexsim.core.config import setting
 from dexsim.hand.description import Hand
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.loop import LoopThread
 from dexsim_real.run.guard import Guard
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import LinkConfig, greet, missing_of
+from dexsim_real.run.options import LoopOptions
+from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.serial_hand import open_port
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class NodeOptions(Config):
+class NodeOptions(LoopOptions):
     """Options in the parameter `options`."""
 
-    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand, and messages, per second."""
-    guard: bool = True
-    """Start a second process that turns the motors off when this one dies or freezes."""
-    link: LinkConfig = setting(LinkConfig())
-    """The line."""
-    hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains of the hand."""
     safety: SafetyConfig = setting(SafetyConfig(watchdog=0.2))
     """Safety limits."""
 
@@ -95,10 +86,7 @@ class HandNode:
         Raises HandError: the hand does not answer, is another one, or something touches a fingertip.
         """
         log = self.node.get_logger().info
-        identity = getattr(self.port, "identity", None)
-        for line in greet(self.port):
-            log(line)
-        for line in (*check_identity(identity, self.hand, self.sensing.calibration), *self.loop.tare()):
+        for line in (*self.port.greet(self.hand, self.sensing.calibration), *self.loop.tare()):
             log(line)
         self.loop.start()
 
@@ -140,10 +128,10 @@ class HandNode:
         joints = self._joint_state(name=list(hand.joint_names))
         joints.header.stamp = stamp
         joints.position, joints.velocity = measured.joint_position.tolist(), sample.velocity.tolist()
-        if "currents" not in missing_of(self.port):
+        if "currents" not in self.port.missing:
             joints.effort = (measured.joint_torque * hand.torque_limit).tolist()
         self._joints.publish(joints)
-        if "taxels" in missing_of(self.port):
+        if "taxels" in self.port.missing:
             return
         for publisher, body, parts in zip(
             self._wrenches, hand.tip_body, tip_wrenches(hand, measured.taxel_force), strict=True

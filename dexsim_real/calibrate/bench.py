@@ -27,8 +27,7 @@ from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.loop import Exchange, ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import HandPort, greet, missing_of
+from dexsim_real.wire.link import HandPort
 from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
@@ -132,7 +131,7 @@ class Bench(ExchangeLoop):
         if port is None:
             assert arguments.port is not None, "`CalibrateArguments` asks for it"
             port = open_port(arguments.port, hand, arguments.link)
-        if not arguments.identify and (lacking := [name for name in missing_of(port) if name != "temperatures"]):
+        if not arguments.identify and (lacking := [name for name in port.missing if name != "temperatures"]):
             raise HandError(
                 f"presses need taxels and currents, and the hand has no {' and no '.join(lacking)}: --identify"
             )
@@ -149,12 +148,10 @@ class Bench(ExchangeLoop):
             # Only during the procedure: long computations in a real-time thread would starve the machine.
             if arguments.realtime:
                 use_realtime()
-            for line in greet(self.port):
-                self._say(line)
-            identity = getattr(self.port, "identity", None)
             calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
-            for line in check_identity(identity, hand, calibration):
+            for line in self.port.greet(hand, calibration):
                 self._say(line)
+            identity = self.port.identity
             meta = {
                 "task": self._task,
                 "serial": identity.serial_number if identity else "",

@@ -6,7 +6,6 @@ in virtual time from its schedule.
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -68,13 +67,6 @@ def limits_for(config: SafetyConfig, controller: Controller) -> SafetyConfig:
     return dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * controller.period))
 
 
-class PolicyTick(NamedTuple):
-    """A tick of the policy, and the sample that it saw."""
-
-    tick: Tick
-    sample: HandSample
-
-
 class PolicyLoop:
     """Sets the joint targets of a run.
 
@@ -104,6 +96,7 @@ class PolicyLoop:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
         self.ticks, self.finger_force = 0, np.zeros(controller.hand.num_fingers)  # number; N, sum over the ticks
         self._approach, self._place, self._motors_off = approach, place, motors_off
+        self.sample: HandSample  # that the newest tick saw
         self._begin: float | None = None  # s, of the approach
         self._anchor = 0
 
@@ -134,7 +127,7 @@ class PolicyLoop:
         self._anchor = self.safety.anchor
         self.controller.start(self.safety.commanded)
 
-    def tick(self, now: float) -> PolicyTick | None:
+    def tick(self, now: float) -> Tick | None:
         """One action of the policy; None without a measurement that is young enough."""
         safety, sample = self.safety, self.safety.sample
         assert sample is not None, "the motors came on at a measured pose"
@@ -151,7 +144,8 @@ class PolicyLoop:
         safety.set_target(tick.target, now, self.objects.lost(now, safety.config.stale_object))
         self.ticks += 1
         self.finger_force += sample.measured.finger_force
-        return PolicyTick(tick, sample)
+        self.sample = sample
+        return tick
 
 
 def smooth(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:

@@ -2,9 +2,12 @@
 
 import errno
 import grp
+import importlib
 import os
 import termios
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from dexsim.core.errors import DexsimError
 
@@ -31,3 +34,17 @@ def explain(port: str, error: Exception) -> str:
         ports = ", ".join(sorted(str(link) for link in Path("/dev/serial/by-id").glob("*")))
         return f"{port}: there is no such port; choose from: {ports or 'none found; check cable and power'}"
     return f"{port}: cannot be opened ({error}); check the name and the cable"
+
+
+def find_function(name: str, given: str, form: str, default: str = "") -> Callable[..., Any]:
+    """The user's function MODULE:FUNCTION, or `default` of MODULE; `given` is the option, `form` what to give.
+
+    Raises:
+      HandError: no such module or function, or the module fails when it is imported.
+    """
+    module, _, function = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), function or default)
+    except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise HandError(f"{given}: {why:.200}; give {form}") from None

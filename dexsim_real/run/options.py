@@ -1,4 +1,4 @@
-"""Options of `python -m dexsim_real.run`: one dataclass that contains the options of every part."""
+"""Options of `python -m dexsim_real.run`, and of every user of the exchange loop."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +16,23 @@ from dexsim_real.wire.link import LinkConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunArguments(Config):
+class LoopOptions(Config):
+    """Options of the exchange loop."""
+
+    guard: bool = True
+    """Start a second process that turns the motors off when this one dies or freezes."""
+    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
+    """Exchanges with the hand per second; a run adjusts it by up to 1 %, to compute during the wait for an answer."""
+    link: LinkConfig = setting(LinkConfig())
+    """The serial line."""
+    hardware: HardwareConfig = setting(HardwareConfig())
+    """Signs, scales and gains of the hand."""
+    safety: SafetyConfig = setting(SafetyConfig())
+    """Safety limits."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunArguments(LoopOptions):
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -47,10 +63,6 @@ class RunArguments(Config):
     no camera."""
     fixed_object: bool = False
     """Run without a camera: assume that the object stays at its nominal position."""
-    guard: bool = True
-    """Start a second process that turns the motors off when this one dies or freezes."""
-    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges per second, adjusted by up to 1 % so that the policy computes during the wait for an answer."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
     """Time to move from the measured pose to the task's start posture; 0 stays at the measured pose."""
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
@@ -63,12 +75,6 @@ class RunArguments(Config):
     """Request real-time priority; continue without it if not permitted."""
     quiet: bool = False
     """Hide the live status."""
-    link: LinkConfig = setting(LinkConfig())
-    """The serial line."""
-    hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains of the hand."""
-    safety: SafetyConfig = setting(SafetyConfig())
-    """Safety limits."""
     optics: CameraConfig = setting(CameraConfig())
     """Pose of the camera, and colour of the object."""
 

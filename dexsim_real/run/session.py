@@ -6,14 +6,12 @@
 import contextlib
 import dataclasses
 import gc
-import hashlib
 import sys
 import termios
 import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from dexsim import load_hand
@@ -22,10 +20,10 @@ from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller, prepare_jax
+from dexsim_real.control.controller import Controller, Tick, prepare_jax
 from dexsim_real.control.motors_off import UNCONFIRMED
-from dexsim_real.control.policy_loop import PolicyLoop, PolicyTick, limits_for
-from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.control.policy_loop import PolicyLoop, limits_for
+from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
@@ -38,8 +36,6 @@ from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.sensors.object_sensors import ObjectSensors
-from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import greet, missing_of
 from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
@@ -181,7 +177,7 @@ class Session:
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.port = open_port(arguments.port, hand, arguments.link, self._tap)
         self.controller = Controller(policy, calibrated_hand(hand, calibration))
-        self.controller.check_measured(missing_of(self.port))
+        self.controller.check_measured(self.port.missing)
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
         self.controller.warm()
         self.sensing.measure(np.zeros((), self.sensing.block))
@@ -198,7 +194,7 @@ class Session:
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = 0.0
         self.outcome = Outcome()
-        self.newest: PolicyTick | None = None
+        self.newest: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
@@ -210,10 +206,8 @@ class Session:
           HandError: something is missing or does not answer.
         """
         arguments, sensing = self.arguments, self.sensing
-        for line in greet(self.port):
+        for line in self.port.greet(sensing.hand, sensing.calibration):
             self._note(line)
-        for note in check_identity(getattr(self.port, "identity", None), sensing.hand, sensing.calibration):
-            self._note(note)
         for line in self.loop.tare():
             self._note(f"warning: {line}")
         self._write_meta()
@@ -311,7 +305,7 @@ class Session:
         sample, sent = self.safety.sample, self.safety.last[0] != Reaction.RELAX
         if sample is None:
             return None
-        target = self.safety.commanded if sent else self.newest.tick.target if self.newest else None
+        target = self.safety.commanded if sent else self.newest.target if self.newest else None
         return HandState(self.sensing.hand, sample.measured, target, sent)
 
     def _await_pose(self) -> None:
@@ -347,17 +341,16 @@ class Session:
         self.pace.next = self.loop.free(self.pace.next)
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
-            newest = policy.tick(now)
-            self.outcome.add(now, newest.tick.target if newest else None, self.safety)
-            if newest is not None:
-                self.newest = newest
-                self._log_tick(now, newest)
+            tick = policy.tick(now)
+            self.outcome.add(now, tick.target if tick else None, self.safety)
+            if tick is not None:
+                self.newest = tick
+                self._log_tick(now, tick, policy.sample)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
         self._check()
 
-    def _log_tick(self, now: float, newest: PolicyTick) -> None:
-        tick, sample = newest
+    def _log_tick(self, now: float, tick: Tick, sample: HandSample) -> None:
         fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
         fields |= {"sequence": sample.sequence, "age": now - sample.time, "readings": vars(tick.readings)}
         self.log.add(Kind.TICK, fields, now)
@@ -384,14 +377,12 @@ class Session:
 
     def _write_meta(self) -> None:
         arguments, policy = self.arguments, self.controller.policy
-        leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params))
         self.log.add(
             Kind.META,
             {
                 "task": policy.task,
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
-                "policy_sha256": hashlib.sha256(leaves).hexdigest(),
                 "hand": record_of(self.sensing.hand),
                 "calibration": arguments.calibration.read_text() if arguments.calibration else "",
                 "tare": self.sensing.tare,

@@ -1,10 +1,10 @@
-"""The status of a run on the terminal: live tables, or a line every few seconds when the output is no terminal."""
+"""The status of a run on the terminal: live tables, or only notes when the output is no terminal."""
 
 import contextlib
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, TextIO, cast
 
 import numpy as np
@@ -18,7 +18,7 @@ from dexsim.hand.description import Hand
 from dexsim_real.core.process import lower_priority
 from dexsim_real.sensors.hand import HandMeasurement
 
-_LIVE, _LINES = 0.25, 5.0  # s between two updates of the tables, and between two lines
+_LIVE = 0.25  # s between two updates of the tables
 
 
 class HandState(NamedTuple):
@@ -96,15 +96,10 @@ class StatusView:
 
     def _run(self) -> None:
         lower_priority()
-        elapsed = 0.0
         while not self._stop.wait(_LIVE):
             self._print_notes()
-            elapsed += _LIVE
             if self._live:
                 self._live.update(self._tables(), refresh=True)
-            elif elapsed >= _LINES:
-                elapsed = 0.0
-                self._notes.append(" | ".join(f"{name} {text}" for name, text in _texts(self._summary())))
         self._print_notes()
 
     def _tables(self) -> Group:
@@ -123,24 +118,19 @@ def _console(quiet: bool = False) -> Console:
 
 
 def _rows(title: str, summary: dict[str, Any]) -> Table:
-    # Escaped, since an error may have text in brackets, which Rich would take for its markup.
-    table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
-    for name, text in _texts(summary):
-        table.add_row(name, escape(text))
-    return table
-
-
-def _texts(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Name and text of each entry that says something."""
+    """A row for each entry that says something."""
 
     def short(value: Any) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
+    # Escaped, since an error may have text in brackets, which Rich would take for its markup.
+    table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
     for name, value in summary.items():
         if isinstance(value, dict):
             value = ", ".join(f"{k} {short(v)}" for k, v in value.items() if v)
         if value not in ("", []):
-            yield name.replace("_", " "), short(value)
+            table.add_row(name.replace("_", " "), escape(short(value)))
+    return table
 
 
 def _hand_tables(state: HandState) -> Table:
@@ -159,8 +149,8 @@ def _hand_tables(state: HandState) -> Table:
             *(f"{bits:04x}" if bits else "-" for bits in measured.errors[joint]),
         )
     fingers = _table("finger", "N", "degC")
-    for finger, name in enumerate(hand.finger_names):
-        fingers.add_row(name, f"{force[finger]:.1f}", f"{heat[hand.num_joints + finger]:.0f}")
+    for name, newtons, degrees in zip(hand.finger_names, force, heat[hand.num_joints :], strict=False):
+        fingers.add_row(name, f"{newtons:.1f}", f"{degrees:.0f}")
     fingers.add_row("sum", f"{force.sum():.1f}", "")
     fingers.add_row("palm board", "", f"{heat[-1]:.0f}")
     both = Table.grid(padding=(0, 3))

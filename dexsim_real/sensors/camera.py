@@ -16,8 +16,7 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
-from dexsim_real.core.errors import HandError
-from dexsim_real.core.names import find_function
+from dexsim_real.core.errors import HandError, find_function
 from dexsim_real.core.process import lower_priority
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]

@@ -2,27 +2,189 @@
 
     python -m dexsim_real.twin --task rotate
 
-It prints the command that runs a policy on it, and ends after its trials or with Ctrl-C.
+It prints the command that runs a policy on it, and ends after its trials or with Ctrl-C. One thread serves the hand's
+port, IMU and camera, and advances the physics. The port has priority. In between, the physics advances in slices of a
+millisecond and follows the wall clock. On a slow machine simulated time slips; the slip is reported.
 """
 
 import dataclasses
+import select
 import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from dexsim.calibration.maps import save_calibration
 from dexsim.core import cli
+from dexsim.core.config import Config, setting
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.process import use_realtime
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.server import Twin, TwinArguments
+from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.twin.wire.firmware import SERIALS
+from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
+from dexsim_real.twin.wire.faults import Injector
+from dexsim_real.twin.wire.firmware import SERIALS, Firmware
+from dexsim_real.twin.wire.line import HandLine, Terminal
 from dexsim_real.wire.serial_hand import check_wire
+
+_BUSY = 0.002  # s, longest that a slice of the physics or a picture takes
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TwinArguments(Config):
+    """Options of `python -m dexsim_real.twin`."""
+
+    task: str = setting("rotate", choices=TASKS)
+    """Task: `rotate` mounts the hand palm up with a cube, `grasp` upside down with various objects."""
+    hand: str = ""
+    """The TOML of a hand of your own, with the joints and taxels that the wire format has; empty for the XHand."""
+    seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
+    """Seed of all random numbers: parameters, objects, noise, faults."""
+    trials: int = setting(10, unit="1", low=1, high=100_000)
+    """Number of trials, with one object each."""
+    seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
+    """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
+    parameters: str = setting("outside", choices=KINDS)
+    """Parameters of hand and object: just outside the ranges of training, inside them, or nominal."""
+    folder: Path | None = None
+    """Folder for the ports `hand` and `imu` (rotate) and the socket `masks` (grasp); None for a new temporary one."""
+    output: Path | None = None
+    """JSON file for results, statistics and events, written at the end; None writes no file."""
+    realtime: bool = True
+    """Request real-time priority; continue without it if not permitted."""
+    plant_model: Path | None = None
+    """Third-party MJCF of the hand, which takes the place of the emulated hand's body and contacts
+    (docs/emulated_hand.md). Its motors are left out: the emulated hand's drive its joints. None for the emulated hand's
+    own."""
+    faults: tuple[str, ...] = ()
+    """Injected faults, each "12.5 stall 0.2" (seconds after the first exchange, kind, values) or "1% flip" (share of
+    the exchanges): flip (wrong bits in an answer); late, stall and disconnect SECONDS; heat JOINT KELVIN SECONDS; error
+    JOINT BITS SECONDS; off JOINT SECONDS; refuse NUMBER SECONDS; angle JOINT RADIANS SECONDS; stuck TIP TAXEL COUNT
+    SECONDS."""
+
+
+class PlantClock:
+    """Keeps the time of a plant at the wall clock.
+
+    Args:
+      plant: the physics.
+      start: s, wall clock at the start of the plant; `now` is its current time.
+      note: called with one line when simulated time slips.
+    """
+
+    SLICE = 0.001  # s, simulated at once
+    MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
+
+    def __init__(self, plant: EmulatedHand, start: float, note: Callable[[str], None]):
+        self.plant, self.now, self._note = plant, start, note
+        self.slipped = 0.0  # s
+        self._noted_at = -1e9
+
+    def catch_up(self, now: float, limit: float = 0.01) -> None:
+        """Advance the plant to a time in s, by at most `limit` s."""
+        lag = now - self.now
+        if lag > self.MAX_LAG:
+            self.now += lag - limit
+            self.slipped += lag - limit
+            if now > self._noted_at + 5.0:
+                self._noted_at = now
+                self._note(f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far")
+        step = min(now - self.now, limit)
+        if step > 0:
+            self.plant.advance(step)
+            self.now += step
+
+
+class Twin:
+    """An emulated hand with its ports, in a folder; `show` is called with one line for every event.
+
+    Raises:
+      HandError: a port or socket cannot be created.
+    """
+
+    def __init__(
+        self,
+        arguments: TwinArguments,
+        plant: EmulatedHand,
+        folder: Path,
+        show: Callable[[str], None] = lambda text: None,
+    ):
+        self.arguments, self.plant, self._show = arguments, plant, show
+        self.start, seed = time.monotonic(), arguments.seed
+        self.clock = PlantClock(plant, self.start, self.note)
+        self.injector = Injector(arguments.faults, seed)
+        terminal, firmware = Terminal(folder / "hand"), Firmware(plant, self.note)
+        self.line = HandLine(terminal, firmware, self.injector, seed=seed, catch_up=self.clock.catch_up, note=self.note)
+        try:
+            if arguments.task == "grasp":
+                self.sensor: EmulatedImu | EmulatedCamera = EmulatedCamera(folder / "masks", plant, seed, self.start)
+            else:
+                self.sensor = EmulatedImu(folder / "imu", plant, seed, self.start)
+        except BaseException:
+            terminal.close()
+            raise
+        self._trial = plant.trial
+        self._stop = False
+
+    def stop(self) -> None:
+        """End soon; may be called from a signal handler."""
+        self._stop = True
+
+    def run(self) -> None:
+        """Run until all trials have ended, or `stop` was called."""
+        self.clock.now = time.monotonic()
+        while not self._stop:
+            now = time.monotonic()
+            self.line.serve(now)
+            # What takes long waits when the port is due soon, but not for ever.
+            due = min(self.clock.now + PlantClock.SLICE, self.sensor.due)
+            free = self.line.due() - now > _BUSY
+            if now >= due and (free or now > due + 0.01):
+                self.clock.catch_up(now, PlantClock.SLICE)
+                self.sensor.serve(now)
+            self._count_trials()
+            pause = (min(due, self.line.due()) if free else self.line.due()) - time.monotonic()
+            ports = [self.line.terminal] if self.line.terminal.connected else []
+            select.select(ports, [], [], max(pause, 0.0))
+
+    def close(self) -> None:
+        """Close all ports."""
+        self.line.terminal.close()
+        self.sensor.close()
+
+    def note(self, text: str) -> None:
+        """Show an event, with its time."""
+        self._show(f"{time.monotonic() - self.start:9.3f} s  {text}")
+
+    def report(self) -> dict[str, Any]:
+        """Results of the trials, and what befell the line; JSON-able."""
+        return {
+            "trials": self.plant.results()[: self.arguments.trials],
+            "line": dict(self.line.counts),
+            "injected_faults": dict(self.injector.injected),
+            "slipped_s": round(self.clock.slipped, 3),
+        }
+
+    def runner_command(self, calibration: Path) -> list[str]:
+        """The command that runs the shipped policy of the task on this hand."""
+        words = ["python", "-m", "dexsim_real.run", self.arguments.task, "--port", str(self.line.terminal.name)]
+        words += ["--calibration", str(calibration), "--yes", *self.sensor.option]
+        return words + (["--hand", self.arguments.hand] if self.arguments.hand else [])
+
+    def _count_trials(self) -> None:
+        if self.plant.trial == self._trial:
+            return
+        self._trial = done = self.plant.trial
+        self.note(f"end of trial {done} of {self.arguments.trials}: {self.plant.results()[done - 1].get('end', '')}")
+        if done >= self.arguments.trials:
+            self._stop = True
+            self.note("all trials are over: the hand's port closes")
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
@@ -34,22 +196,8 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
         trials=arguments.trials,
         kind=arguments.parameters,
         seconds=arguments.seconds,
-        first=arguments.first,
         plant_model=arguments.plant_model,
     )
-
-
-def runner_command(twin: Twin, calibration: Path) -> list[str]:
-    """The command that runs the shipped policy of the task on an emulated hand."""
-    arguments, words = twin.arguments, ["python", "-m", "dexsim_real.run", twin.arguments.task]
-    words += ["--port", str(twin.line.terminal.name), "--calibration", str(calibration), "--yes"]
-    if arguments.hand:
-        words += ["--hand", arguments.hand]
-    if twin.imu:
-        words += ["--imu", str(twin.imu.terminal.name)]
-    if twin.masks:
-        words += ["--camera", f"unix:{twin.masks.path}"]
-    return words
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -74,7 +222,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             _show(
                 f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
-                f"    {shlex.join(runner_command(twin, calibration))}"
+                f"    {shlex.join(twin.runner_command(calibration))}"
             )
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")

@@ -32,7 +32,7 @@ from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
 from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
-from dexsim_real.wire.link import BITS_PER_BYTE, LinkCounts, Reply
+from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, LinkCounts, Reply
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
@@ -60,7 +60,7 @@ def ideal_calibration(hand: Hand) -> Calibration:
     )
 
 
-class VirtualPort:
+class VirtualPort(HandPort):
     """`HandPort` of an emulated hand in virtual time, and that time: `clock` and `sleep` take the place of `time`'s."""
 
     def __init__(self, plant: EmulatedHand):
@@ -228,6 +228,6 @@ class VirtualRun:
         self.loop.pace.wait()
 
     def _tick(self) -> None:
-        newest = self.policy.tick(self.port.time)
-        if newest is not None and self.trace is not None:
-            self.trace.append({"time": self.port.time, "tick": newest.tick, "measured": newest.sample.measured})
+        tick = self.policy.tick(self.port.time)
+        if tick is not None and self.trace is not None:
+            self.trace.append({"time": self.port.time, "tick": tick, "measured": self.policy.sample.measured})

@@ -88,8 +88,6 @@ class DriverPort(ReconnectingPort):
     `hand` gives the number of joints, fingers and taxels.
     """
 
-    identity = None
-
     def __init__(self, driver: HandDriver, hand: Hand, config: LinkConfig, **options: Any):
         super().__init__(config, passive_command(hand.num_joints), **options)
         self.driver, self._hand = driver, hand
@@ -97,7 +95,7 @@ class DriverPort(ReconnectingPort):
 
     @property
     def missing(self) -> list[str]:
-        """What this hand does not measure, names in `WITHOUT`."""
+        """See `HandPort.missing`."""
         return [name for name in WITHOUT if name not in self.driver.measures]
 
     def warnings(self) -> list[str]:
@@ -115,7 +113,7 @@ class DriverPort(ReconnectingPort):
         return line
 
     def close(self) -> None:
-        """See `ReconnectingPort.close`."""
+        """See `HandPort.close`."""
         self._connected = False
         self.driver.close()
 

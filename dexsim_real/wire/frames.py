@@ -23,9 +23,6 @@ OVERHEAD = HEADER.size + 2  # bytes of a frame without data
 HOST = 0xFE
 BROADCAST = 0xFF
 JOINTS, TIPS, TAXELS = 12, 5, 120
-TIP_JOINTS = (2, 5, 7, 9, 11)
-"""Joints whose state names a tip sensor, thumb to pinky."""
-TIP_IDS = (0x11, 0x12, 0x13, 0x14, 0x15)
 
 
 class FrameError(DexsimError):
@@ -33,17 +30,12 @@ class FrameError(DexsimError):
 
 
 class Command(enum.IntEnum):
-    """Command byte of a frame, in requests and answers."""
+    """Command byte of a frame, in requests and answers: those that the bridge knows."""
 
     ERROR = 0x00
     EXCHANGE = 0x02  # request: joint commands; answer: whole state
-    SET_MODE = 0x08
-    READ_MODE = 0x09
-    CLEAR_PRESSURE = 0x12  # zero the taxels of one tip
     VERSION = 0x13
-    RESET = 0x14
     READ_REGISTER = 0x15
-    ACKNOWLEDGE = 0xB0
 
 
 class Mode(enum.IntEnum):
@@ -108,20 +100,13 @@ def driver_block(joints: int, fingers: int, taxels: int) -> np.dtype:
 HAND_REPLIES: dict[int, range] = {
     Command.EXCHANGE: range(STATE_BLOCK.itemsize, STATE_BLOCK.itemsize + 1),
     Command.ERROR: range(1, 65),
-    Command.ACKNOWLEDGE: range(1, 65),
     Command.VERSION: range(1, 65),
-    Command.CLEAR_PRESSURE: range(2, 65),
-    Command.READ_MODE: range(2, 65),
     Command.READ_REGISTER: range(5, 65),
 }
 """Valid data lengths of answers. None fits a request, so the echo of an adapter is never mistaken for the hand."""
 HOST_REQUESTS: dict[int, range] = {
     Command.EXCHANGE: range(COMMAND_BLOCK.itemsize, COMMAND_BLOCK.itemsize + 1),
     Command.VERSION: range(0, 1),
-    Command.READ_MODE: range(0, 2),
-    Command.SET_MODE: range(1, 33),
-    Command.CLEAR_PRESSURE: range(0, 2),
-    Command.RESET: range(0, 2),
     Command.READ_REGISTER: range(1, 5),
 }
 """Valid data lengths of requests."""
@@ -185,32 +170,20 @@ class Parser:
         return len(self._buffer)
 
     def _scan(self, final: bool) -> list[Frame]:
-        buffer, frames, at = self._buffer, [], 0
-        while True:
-            head = buffer.find(HEAD, at)
-            if head < 0:
-                # The last byte may be the first half of a head.
-                at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > at)
-                break
+        buffer, found, at = self._buffer, [], 0
+        while (head := buffer.find(HEAD, at)) >= 0:
             at = head
             end = self._frame_end(at)
-            if end is None:
-                at += 1
-            elif end > len(buffer):
-                if not final:
-                    break
-                at += 1
-            elif self._sound(at, end):
-                _, source, target, command, size = HEADER.unpack_from(buffer, at)
-                data = bytes(buffer[at + HEADER.size : at + HEADER.size + size])
-                frames.append(Frame(source, target, command, data))
-                self.frames += 1
-                at = end
-            else:
-                self.crc_errors += 1
-                at += 1
+            if end is not None and end > len(buffer) and not final:
+                break
+            frame = None if end is None or end > len(buffer) else self._take(at, end)
+            found += [frame] if frame else []
+            at = end if frame and end else at + 1
+        else:
+            # The last byte may be the first half of a head.
+            at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > at)
         del buffer[:at]
-        return frames
+        return found
 
     def _frame_end(self, at: int) -> int | None:
         """End of the frame that begins here, as far as its header has arrived; None when there is no such frame."""
@@ -221,9 +194,15 @@ class Parser:
         span = self._lengths.get(command)
         return at + OVERHEAD + size if span is not None and size in span else None
 
-    def _sound(self, at: int, end: int) -> bool:
-        with memoryview(self._buffer) as view:
-            return crc16(view[at : end - 2]) == int.from_bytes(view[end - 2 : end], "little")
+    def _take(self, at: int, end: int) -> Frame | None:
+        """The frame in these bytes; None for a wrong checksum."""
+        whole = bytes(self._buffer[at:end])
+        if crc16(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
+            self.crc_errors += 1
+            return None
+        self.frames += 1
+        _, source, target, command, _ = HEADER.unpack_from(whole)
+        return Frame(source, target, command, whole[HEADER.size : -2])
 
 
 def command_block(
@@ -249,7 +228,6 @@ def empty_state() -> np.ndarray:
     """A `STATE_BLOCK` of zeros with its ids set."""
     block = np.zeros((), STATE_BLOCK)
     block["joint"]["id"] = np.arange(JOINTS)
-    block["joint"]["sensor_id"][list(TIP_JOINTS)] = TIP_IDS
     return block
 
 

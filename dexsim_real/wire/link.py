@@ -1,17 +1,19 @@
 """The link to a hand: configuration, statistics, and the port that the exchange loop talks to.
 
-`HandPort` has two implementations: `dexsim_real.wire.serial_hand.SerialHand` for the XHand's serial line, and
-`dexsim_real.wire.driver.DriverPort` around a driver for any other hand.
+`dexsim_real.wire.serial_hand.SerialHand` is the `HandPort` of the XHand's serial line,
+`dexsim_real.wire.driver.DriverPort` that of a driver for any other hand.
 """
 
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
+from dexsim.calibration.maps import Calibration
 from dexsim.core.config import Config, Range, setting
+from dexsim.hand.description import Hand
+from dexsim_real.wire.identity import Identity, check_identity
 
 _PAUSE = 0.002  # s, of a call while the hand is gone
 BITS_PER_BYTE = 10  # 8N1
@@ -125,7 +127,50 @@ class Reply:
     generation: int  # number of handshakes; it grows when the hand was disconnected
 
 
-class ReconnectingPort:
+class HandPort:
+    """The interface of a hand. `exchange` is called from one thread only."""
+
+    counts: LinkCounts
+    identity: Identity | None = None  # None where the port cannot tell it
+    refusal: Refusal | None = None  # why the newest exchange was refused
+
+    @property
+    def missing(self) -> list[str]:
+        """What the hand does not measure, names in `dexsim_real.wire.driver.WITHOUT`."""
+        return []
+
+    def greet(self, hand: Hand, calibration: Calibration | None) -> list[str]:
+        """Connect the hand of a model; returns lines for the user. HandError: as for `connect`, or another hand."""
+        lines = [self.connect(), *(f"warning: {warning}" for warning in self.warnings())]
+        return lines + check_identity(self.identity, hand, calibration)
+
+    def warnings(self) -> list[str]:
+        """Lines for the user about what is connected."""
+        return []
+
+    def connect(self) -> str:
+        """Open the port and identify the hand; returns a line that describes it. Motors stay off.
+
+        Raises:
+          HandError: the port cannot be opened, or the hand does not answer.
+        """
+        raise NotImplementedError
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        """Send joint commands (`frames.command_block`); None when no valid answer arrived in time.
+
+        Line errors never raise. It returns within a second, also while the hand is gone: the guard process takes a
+        runner that does not move for dead. After a reconnection the given command is not sent: the first reply of a new
+        generation comes from a passive hand. A passive command is answered only once the motors are off.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the port, motors as they are; no error where it is closed already."""
+        raise NotImplementedError
+
+
+class ReconnectingPort(HandPort):
     """What ports have in common: a line that fails is opened again, after waits that double at each attempt.
 
     Args:
@@ -144,7 +189,6 @@ class ReconnectingPort:
         clock: Callable[[], float] | None = None,
     ):
         self.config, self.counts = config, LinkCounts()
-        self.refusal: Refusal | None = None  # why the newest request was refused
         self._tap = tap or (lambda direction, data: None)
         self._clock, self._sleep = clock or time.monotonic, time.sleep
         self._connected, self._returning, self._generation = False, False, 0
@@ -170,10 +214,6 @@ class ReconnectingPort:
         self._returning &= reply is None
         return reply
 
-    def close(self) -> None:
-        """Close the line. The motors keep doing what they were told last."""
-        raise NotImplementedError
-
     def _exchange(self, command: np.ndarray) -> Reply | None:
         """One exchange on an open line. OSError: the line failed."""
         raise NotImplementedError
@@ -181,52 +221,3 @@ class ReconnectingPort:
     def _reopen(self) -> None:
         """Open the line to the hand that was there before. OSError: it is still gone."""
         raise NotImplementedError
-
-
-def refusal_of(port: "HandPort") -> Refusal | None:
-    """Why the newest exchange was refused, if the port tells it."""
-    return getattr(port, "refusal", None)
-
-
-def missing_of(port: "HandPort") -> list[str]:
-    """What the hand does not measure, by the names of `dexsim_real.wire.driver.WITHOUT`."""
-    return getattr(port, "missing", [])
-
-
-def greet(port: "HandPort") -> list[str]:
-    """Connect a hand; returns lines for the user: what it is, and the port's warnings. HandError: see `HandPort`."""
-    line = port.connect()
-    warnings = port.warnings() if hasattr(port, "warnings") else []
-    return [line, *(f"warning: {warning}" for warning in warnings)]
-
-
-class HandPort(Protocol):
-    """The interface of a hand. `exchange` is called from one thread only.
-
-    A port may also have `warnings()`, lines for the user; `missing`, what the hand does not measure; `identity`, a
-    `dexsim_real.wire.identity.Identity` or None; and `refusal`, a `Refusal` when the newest exchange was refused, else
-    None.
-    """
-
-    counts: LinkCounts
-
-    def connect(self) -> str:
-        """Open the port and identify the hand; returns a line that describes it. Motors stay off.
-
-        Raises:
-          HandError: the port cannot be opened, or the hand does not answer.
-        """
-        ...
-
-    def exchange(self, command: np.ndarray) -> Reply | None:
-        """Send joint commands (`frames.command_block`); None when no valid answer arrived in time.
-
-        Line errors never raise. It returns within a second, also while the hand is gone: the guard process takes a
-        runner that does not move for dead. After a reconnection the given command is not sent: the first reply of a new
-        generation comes from a passive hand. A passive command is answered only once the motors are off.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close the port; no error where it is closed already."""
-        ...

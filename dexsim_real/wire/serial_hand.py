@@ -14,8 +14,7 @@ import numpy as np
 
 from dexsim.core.install import install_line
 from dexsim.hand.description import Hand
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
-from dexsim_real.core.names import find_function
+from dexsim_real.core.errors import PORT_ERRORS, HandError, explain, find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
@@ -34,14 +33,14 @@ _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest
 class SerialHand(ReconnectingPort):
     """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
-    `identity` is what the hand told about itself
-    when it was connected. Another hand on the port is refused: it is told to turn its motors off, and nothing else.
-    `options` are those of `ReconnectingPort`.
+    `identity` is what the hand told about itself when it was connected. Another hand on the port is refused: it is told
+    to turn its motors off, and nothing else. `options` are those of `ReconnectingPort`.
     """
 
     def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
         super().__init__(config or LinkConfig(), passive_command(), **options)
-        self.port, self.identity = port, Identity()
+        self.port = port
+        self.identity: Identity = Identity()
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
@@ -64,7 +63,7 @@ class SerialHand(ReconnectingPort):
         return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
     def close(self) -> None:
-        """See `ReconnectingPort.close`."""
+        """See `HandPort.close`."""
         self._connected = False
         if self._serial is not None:
             with contextlib.suppress(OSError):

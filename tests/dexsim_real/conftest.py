@@ -1,10 +1,30 @@
 """Fixtures of the bridge's tests."""
 
+import jax
+import numpy as np
 import pytest
+
+from dexsim_real.control.controller import Controller
+
+
+@pytest.fixture(scope="session")
+def controller_of():
+    """The controller of a policy on a hand, compiled once for all tests."""
+    made = {}
+
+    def controller(policy, hand):
+        weights = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params))
+        key = policy.task, hand.name, hash(weights)
+        if key not in made:
+            made[key] = Controller(policy, hand)
+        return made[key]
+
+    return controller
 
 
 @pytest.fixture
-def jax_as_it_is(monkeypatch):
+def jax_as_it_is(monkeypatch, controller_of):
     """Runs within the tests' process leave the flags that other tests compile with alone."""
+    monkeypatch.setattr("dexsim_real.run.session.Controller", controller_of)
     monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
     monkeypatch.setattr("dexsim_real.replay.__main__.prepare_jax", lambda: None)

@@ -7,43 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy_stand_in
+from scripted_driver import ScriptedDriver
 
 from dexsim import load_hand
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real import ros
-from dexsim_real.wire.driver import DriverState
 
 STEP = 0.012  # s
 
 
-class Follower:
-    """A driver whose joints go a third of the way at each answer, with one finger pressed."""
-
-    def __init__(self, hand, measures=("currents", "taxels")):
-        self.measures, self.hand, self.on, self.sent = frozenset(measures), hand, False, []
-        self.position = np.clip(0.2, hand.joint_lower, hand.joint_upper).astype(float)
-        self.force = np.zeros((hand.num_fingers, hand.num_taxels))
-
-    def connect(self):
-        return "a follower"
-
-    def send(self, targets):
-        self.on = targets.on
-        self.sent.append(targets)
-        if self.on:
-            self.position = self.position + (targets.position - self.position) / 3
-
-    def read(self):
-        joints = self.hand.num_joints
-        return DriverState(
-            self.position,
-            np.full(joints, self.on),
-            np.full(joints, -0.2) if "currents" in self.measures else None,
-            taxel_force=self.force if "taxels" in self.measures else None,
-        )
-
-    def close(self):
-        self.on = None
+def follower(hand, measures=("currents", "taxels")):
+    """Joints that go a third of the way at each answer."""
+    driver = ScriptedDriver(hand, measures, 1 / 3)
+    if "currents" in measures:
+        driver.state.current[:] = -0.2
+    return driver
 
 
 @pytest.fixture
@@ -81,17 +59,17 @@ def make(monkeypatch, leap):
 
 
 def test_joint_states_wrenches_and_taxels_are_those_of_the_hand(make, leap):
-    driver = Follower(leap)
+    driver = follower(leap)
     node, hand, turn = make(driver)
-    driver.force[1, 5:9] = 1.5
+    driver.state.taxel_force[1, 5:9] = 1.5
     turn(12)
     joints = node.topics["joint_states"][-1]
     assert joints.name == list(leap.joint_names) and joints.header.stamp == "now"
-    np.testing.assert_allclose(joints.position, driver.position, atol=1e-6)
+    np.testing.assert_allclose(joints.position, driver.state.position, atol=1e-6)
     np.testing.assert_allclose(joints.effort, 0.2 * leap.torque_limit, rtol=1e-5)  # -0.2 A, by the default scale
     array = node.topics["~/taxels"][-1]
     assert [(dim.label, dim.size, dim.stride) for dim in array.layout.dim] == [("finger", 4, 192), ("taxel", 48, 48)]
-    np.testing.assert_allclose(np.reshape(array.data, (4, 48)), driver.force, rtol=1e-5)
+    np.testing.assert_allclose(np.reshape(array.data, (4, 48)), driver.state.taxel_force, rtol=1e-5)
     # Against the palm frame's taxels: the same force and torque, turned into the frame of the tip's body.
     pose = forward_kinematics(leap, hand.safety.sample.measured.joint_position)
     force = -1.5 * np.array(taxel_normals(leap, pose))[1, 5:9]
@@ -108,7 +86,7 @@ def test_joint_states_wrenches_and_taxels_are_those_of_the_hand(make, leap):
 
 
 def test_commands_move_the_hand_within_the_safety_until_their_stream_ends(make, leap):
-    driver = Follower(leap)
+    driver = follower(leap)
     node, hand, turn = make(driver, options="--no-guard --hardware.kp 600")
     kind, take = node.subscriptions["~/commands"]
     far = kind(data=(leap.joint_upper + 1.0).tolist())
@@ -126,30 +104,27 @@ def test_commands_move_the_hand_within_the_safety_until_their_stream_ends(make, 
     turn(120)
     assert hand.safety.latched and not driver.on, "nobody commands any more"
     assert not node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace()).success
+    driver = follower(leap)
+    node, _, turn = make(driver)
+    turn(20)
+    for data in (True, False):
+        node.services["~/motors"](SimpleNamespace(data=data), SimpleNamespace())
+        turn(2)
+        assert driver.on == data, "the service"
 
 
 def test_a_hand_without_taxels_or_currents_publishes_what_it_has(make, leap):
-    node, _, turn = make(Follower(leap, ()))
+    node, _, turn = make(follower(leap, ()))
     turn(3)
     assert node.topics["joint_states"][-1].effort == []
     assert node.topics["~/taxels"] == node.topics["~/wrenches/index"] == []
     assert any("no taxels" in line for line in node.said) and any("no currents" in line for line in node.said)
 
 
-def test_the_service_turns_the_motors_off_for_good(make, leap):
-    driver = Follower(leap)
-    node, _, turn = make(driver)
-    turn(20)
-    for data in (True, False):
-        node.services["~/motors"](SimpleNamespace(data=data), SimpleNamespace())
-        turn(2)
-        assert driver.on == data
-
-
 @pytest.mark.parametrize("way", [KeyboardInterrupt, RuntimeError])
 def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
     """The command itself, with its thread."""
-    driver = Follower(leap)
+    driver = follower(leap)
     monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
     node = rclpy_stand_in.Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard --safety.stale 2")
 
@@ -163,4 +138,4 @@ def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
     monkeypatch.setattr(ros, "prepare_jax", lambda: None)
     with pytest.raises(way):
         ros.main()
-    assert driver.on is None and not driver.sent[-1].on and node.said[-1] == "destroyed"
+    assert driver.calls[-1] == "close" and not driver.sent[-1].on and node.said[-1] == "destroyed"

@@ -12,7 +12,7 @@ import numpy as np
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.identity import Identity
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.link import HandPort, LinkCounts, Reply
 
 EXCHANGE = 0.0096  # s
 
@@ -30,7 +30,7 @@ class Plate:
     arms: np.ndarray | None = None  # [12] m, as the hand is now
 
 
-class BenchHand:
+class BenchHand(HandPort):
     """`HandPort` with a clock of its own.
 
     Truth, one entry a joint: Nm/A, efficiency pressing and giving way, no-load A, zero error A.

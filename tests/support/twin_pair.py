@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 from twin_plant import REST, ScriptedPlant
 
-from dexsim_real.twin.server import Twin, TwinArguments
-from dexsim_real.twin.wire.faults import BYTES, Injector
+from dexsim_real.twin.__main__ import Twin, TwinArguments
+from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.line import HandLine
 from dexsim_real.wire import frames
@@ -153,16 +153,15 @@ class Pair(Cable):
     def agreement(self):
         """What the host counted, beside what was injected."""
         counts, line, made = self.port.counts, self.line.counts, self.injector.injected
-        answers, requests = (sum(made[f"{kind} {side}"] for kind in BYTES) for side in ("answer", "request"))
         return {
-            "corrupt": (counts.corrupt, answers),
+            "corrupt": (counts.corrupt, made["flip"]),
             "lost": (counts.lost, made["disconnect"]),
             # What the hand never answered, and what came too late.
-            "silent": (counts.silent, requests + line["ignored"] + counts.late),
+            "silent": (counts.silent, line["ignored"] + counts.late),
             "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
             "sent": (counts.sent, line["requests"]),
             "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
-            "damaged": (line["damaged answers"] + line["damaged requests"], answers + requests),
+            "damaged": (line["damaged answers"], made["flip"]),
         }
 
 

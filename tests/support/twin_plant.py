@@ -10,7 +10,6 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.wire.frames import Mode
 
 REST = np.array([0.3] * 3 + [0.0] + [0.3] * 8)
-SLACK = 0.006  # s, by which the interval between two commands may be shorter at the hand than at the bridge
 
 
 class ScriptedPlant:
@@ -30,7 +29,6 @@ class ScriptedPlant:
         self.time, self.angle = 0.0, REST.copy()
         self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
         self.motors = None
-        self.orders = []  # s; rad, true angles; `frames.COMMAND_BLOCK`
 
     @property
     def trial(self):
@@ -38,7 +36,6 @@ class ScriptedPlant:
 
     def drive(self, motors):
         self.motors = motors
-        self.orders.append((self.time, self.angle.copy(), motors))
 
     def advance(self, seconds):
         self.time += seconds
@@ -54,7 +51,6 @@ class ScriptedPlant:
         force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
         force[:, 40:50, 0] = -0.5 * force[:, 40:50, 2]
         return PlantMeasurement(
-            time=self.time,
             joint_position=self.angle.copy(),
             joint_velocity=self.velocity.copy(),
             current=-100.0 * self.velocity,
@@ -68,24 +64,6 @@ class ScriptedPlant:
 
     def results(self):
         return [{"trial": k} for k in range(self.trial + 1)]
-
-    def violations(self, hand):
-        """Limits of the bridge that the commands exceeded: compared with the true angles, not the reported ones."""
-        names, before = [], None
-        for time, angles, motors in self.orders:
-            on, position = motors["mode"] != Mode.PASSIVE, motors["position"].astype(float)
-            stays = np.zeros(12, bool) if before is None else on & (before[1]["mode"] != Mode.PASSIVE)
-            away = np.abs(position - angles)
-            outside = (position < hand.joint_lower - 1e-5) | (position > hand.joint_upper + 1e-5)
-            names += ["range"] * bool(np.any(on & outside))
-            names += ["current limit"] * bool(np.any(on & (motors["torque_max"] > 400)))
-            names += ["reach"] * bool(np.any(on & (away > 0.75)))
-            names += ["start"] * bool(np.any(on & ~stays & (away > 0.05)))
-            if before is not None:
-                step = np.where(stays, np.abs(position - before[1]["position"]), 0.0).max()
-                names += ["speed"] * bool(step > 7.0 * (time - before[0] + SLACK))
-            before = time, motors
-        return names
 
 
 def make(arguments, hand):

@@ -18,16 +18,9 @@ from dexsim_real.twin.plant.parameters import TrialParameters, skill_of
 from dexsim_real.twin.plant.scene import Scene
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, turn
 
-POSTURES = {
-    "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
-    "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5),
-}
-"""Start posture [12] rad by task."""
-REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
-"""Nominal position [3] m of the object by task, palm frame."""
-PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
-"""Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
-are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
+ROTATE_PLACE = (0.007, 0.079)
+"""Position along the palm (y, z) m of a right hand where a cube is placed: the centre of the start states in training.
+Few of them are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
 
 
 class Start(NamedTuple):
@@ -39,14 +32,16 @@ class Start(NamedTuple):
 
 
 def start_of(hand: Hand, task: str) -> Start:
-    """The start on the XHand, or of a grasp by the TOML of another hand. HandError: its TOML has no grasp."""
-    task = skill_of(task)
-    if (hand.num_joints, hand.num_taxels) == (len(POSTURES[task]), 120):
-        side = np.array([1.0, hand.thumb_side, 1.0])
-        return Start(np.array(POSTURES[task]), np.array(REFERENCES[task]) * side, np.array(PLACES[task]) * side[1:])
-    if task != "grasp" or not (hand.grasp_posture and hand.grasp_centre):
-        raise HandError(f"{hand.name}: the emulated hand needs a [grasp] with posture and centre in its TOML")
-    return Start(np.array(hand.grasp_posture), np.array(hand.grasp_centre), np.array(hand.grasp_centre[1:]))
+    """The start by the hand's TOML. HandError: there is none in it."""
+    if skill_of(task) == "grasp":
+        posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
+        place = np.array(reference[1:])
+    else:
+        posture, reference, names = hand.rotate_posture, hand.rotate_reference, "[rotate] with posture and reference"
+        place = np.array(ROTATE_PLACE) * (hand.thumb_side, 1.0)
+    if not (posture and reference):
+        raise HandError(f"{hand.name}: the emulated hand needs a {names} in its TOML")
+    return Start(np.array(posture), np.array(reference), place)
 
 
 MOUNT = (-0.2, -0.2)  # rad, pitch and roll of the hand that is palm up: wrist and thumb side lowered (raised)

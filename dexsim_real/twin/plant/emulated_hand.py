@@ -44,7 +44,6 @@ _OBJECTS = 200  # sampled for a trial, until one has room between the fingers
 class PlantMeasurement:
     """Readings of the emulated hand's sensors at one time, before the quantisation of the wire."""
 
-    time: float  # s since the start of the plant
     joint_position: np.ndarray  # [12] rad, from the encoders
     joint_velocity: np.ndarray  # [12] rad/s
     current: np.ndarray  # [12] mA, positive when opening
@@ -144,7 +143,6 @@ class EmulatedHand:
         current = current + parameters.current_noise * rng.standard_normal(current.shape)
         taxels = next((f for time, f in reversed(self._samples) if time <= self.time - late + 1e-9), self._no_force)
         return PlantMeasurement(
-            time=self.time,
             joint_velocity=past.qvel[self._scene.drive_dof],
             joint_position=encoder,
             current=-1000.0 * current,
@@ -221,8 +219,8 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
-        reference, fingers = self._start.reference, self.hand.num_fingers
-        self._referee = Referee(self.task, self._seconds, reference, fingers, self.hand.thumb_side)
+        fingers, side = self.hand.num_fingers, self.hand.thumb_side
+        self._referee = Referee(self.task, self._start.reference, self._seconds, fingers, side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()

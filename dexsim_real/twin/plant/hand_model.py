@@ -14,6 +14,7 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies
+from dexsim.hand.mjcf import read_mjcf
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF
@@ -43,17 +44,12 @@ def own_model(hand: Hand) -> HandModel:
 
     Coupled joints follow the motor's side of the gear, without its play.
     """
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    _delete(spec, *spec.actuators, *spec.sensors, *spec.keys)
+    spec = read_mjcf(hand)
     spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
     tips = [hand.body_names[body] for body in hand.tip_body]
     for tip in tips:
         spec.body(tip).add_site(name=f"{tip}_taxels")
-    data = mujoco.MjData(spec.compile())
-    mujoco.mj_kinematics(data.model, data)
-    palm = data.body(hand.palm)
-    spec = _in_palm_frame(spec, (palm.xpos, palm.xmat.reshape(3, 3)))
-    lattices = _prefixed(f"{tip}_taxels" for tip in tips)
+    spec, lattices = _in_palm_frame(spec, (np.zeros(3), np.eye(3))), _prefixed(f"{tip}_taxels" for tip in tips)
     return HandModel("emulated hand", spec, _prefixed(hand.joint_names), hand.torque_limit, lattices)
 
 

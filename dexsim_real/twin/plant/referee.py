@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dexsim_real.twin.plant.assistant import REFERENCES
 from dexsim_real.twin.plant.parameters import skill_of
 from dexsim_real.twin.plant.shapes import matrix, product, turn
 
@@ -68,8 +67,8 @@ class Referee:
 
     Args:
       task: "grasp" or "rotate".
+      reference: [3] m, nominal position of the object.
       seconds: time limit; None is that of the task.
-      reference: [3] m, nominal position of the object; None is that on the XHand.
       fingers: their number.
       thumb_side: the hand's; the goals of a left hand are those of its mirror image.
     """
@@ -77,8 +76,8 @@ class Referee:
     def __init__(
         self,
         task: str,
+        reference: np.ndarray,
         seconds: float | None = None,
-        reference: np.ndarray | None = None,
         fingers: int = 5,
         thumb_side: float = 1.0,
     ):
@@ -86,8 +85,7 @@ class Referee:
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
-        self._reference = np.array(REFERENCES[task] if reference is None else reference)
-        self._step = thumb_side * GOAL_STEP
+        self._reference, self._step = np.asarray(reference), thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
         self._force, self._speed = np.zeros(fingers), 0.0

@@ -87,8 +87,9 @@ def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:
 class EmulatedImu:
     """The emulated IMU on a terminal of its own: call `serve` when `due`; missed samples are skipped."""
 
-    def __init__(self, link: Path, plant: EmulatedHand, *, seed: int, start: float):
+    def __init__(self, link: Path, plant: EmulatedHand, seed: int, start: float):
         self.terminal, self.frames, self.due = Terminal(link), ImuFrames(plant, seed), start
+        self.option = "--imu", str(link)  # of the runner
 
     def close(self) -> None:
         self.terminal.close()
@@ -109,8 +110,9 @@ class EmulatedCamera:
       HandError: the socket cannot be created.
     """
 
-    def __init__(self, path: Path, plant: EmulatedHand, *, seed: int, start: float):
+    def __init__(self, path: Path, plant: EmulatedHand, seed: int, start: float):
         self.path, self.due, self.sent = path, start, 0
+        self.option = "--camera", f"unix:{path}"
         self._plant, self._rng = plant, np.random.default_rng(seed)
         self._client: socket.socket | None = None
         self._waiting = b""  # what the client has not read yet

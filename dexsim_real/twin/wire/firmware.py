@@ -6,11 +6,12 @@ public source describes the meaning of the error bits: they are defined here.
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, PlantMeasurement
-from dexsim_real.twin.wire.faults import ALL, Fault
+from dexsim_real.twin.wire.faults import Fault
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode, passive_command
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
@@ -46,8 +47,7 @@ class Firmware:
         self._registers = {SERIAL_NUMBER.to_bytes(2, "little"): SERIALS[side], SIDE.to_bytes(2, "little"): side}
         self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = passive_command()  # `frames.COMMAND_BLOCK` that the joints execute
-        self.faults: list[tuple[float, Fault]] = []  # that last now, and until when (s)
-        self.angles = np.zeros(frames.JOINTS)  # rad, true angles of the last state sent
+        self.faults: list[tuple[float, str, dict[str, Any]]] = []  # that last now: until when (s), kind, values
         self._hot = np.zeros(frames.JOINTS, bool)
 
     @property
@@ -57,15 +57,13 @@ class Firmware:
 
     def begin(self, fault: Fault, now: float) -> None:
         """Begin a fault of the board at a time in s; it ends by itself."""
-        if fault.kind == "jam":
-            fault.radians = float(self.angles[fault.joint])  # where the joint is now
-        self.faults.append((now + getattr(fault, "seconds", np.inf), fault))
+        self.faults.append((now + fault.values["seconds"], fault.kind, fault.values))
 
     def answer(self, frame: Frame, now: float) -> Frame | None:
         """Execute a frame and return the answer; None for a frame addressed to another hand."""
         if frame.target not in (_ADDRESS, frames.BROADCAST):
             return None
-        self.faults = [(until, fault) for until, fault in self.faults if until >= now]
+        self.faults = [fault for fault in self.faults if fault[0] >= now]
         asked = command = Command(frame.command)
         try:
             if asked == Command.EXCHANGE:
@@ -86,7 +84,7 @@ class Firmware:
         """A `frames.STATE_BLOCK` of a measurement, with the quantisation of the wire."""
         block = frames.empty_state()
         joint, tip = block["joint"], block["tip"]
-        joint["position"] = _angles(measured)
+        joint["position"] = np.round(measured.joint_position / _TICK) * _TICK
         joint["current"] = _whole(measured.current, np.int16)
         joint["velocity"] = _whole(1e3 * measured.joint_velocity, np.int16)
         raw = (np.round(joint["position"] / _TICK).astype(int) + 2048) & 0xFFF
@@ -95,25 +93,16 @@ class Firmware:
         joint["joint_error"] = OVERHEATED * self._hot
         counts = np.round(measured.taxel_force / FORCE_PER_COUNT).astype(np.int32)
         tip["taxel_temperature"] = tip["temperature"] = _TIP
-        for fault in self._lasting("stuck"):
-            counts[fault.tip, fault.taxel] = 0, 0, fault.count
+        for value in self._lasting("stuck"):
+            counts[value["tip"], value["taxel"]] = 0, 0, value["count"]
         for axis, name in enumerate("xyz"):
             kind = np.uint8 if name == "z" else np.int8
             tip["taxel"][name] = _whole(counts[..., axis], kind)
             tip["total"][name] = _whole(counts[..., axis].sum(-1), kind)
-        for fault in self._lasting("angle"):
-            own = joint["position"][fault.joint] if fault.form == "offset" else 0.0
-            joint["position"][fault.joint] = own + fault.radians
-        for fault in self._lasting("error"):
-            joint[f"{fault.board}_error"][fault.joint] |= fault.bits
-        for fault in self._lasting("jam"):
-            if self.motors["mode"][fault.joint] != Mode.PASSIVE:
-                joint["current"][fault.joint] = -fault.milliamperes
-        for fault in self._lasting("heat"):
-            if fault.part == "palm":
-                joint["temperature"] += np.uint16(fault.kelvin) << 8
-            elif fault.part.startswith("tip"):
-                tip["temperature"][int(fault.part[3:])] += np.uint8(fault.kelvin)
+        for value in self._lasting("angle"):
+            joint["position"][value["joint"]] += value["radians"]
+        for value in self._lasting("error"):
+            joint["joint_error"][value["joint"]] |= value["bits"]
         return block
 
     def _exchange(self, data: bytes) -> bytes:
@@ -127,44 +116,35 @@ class Firmware:
             raise _Refusal(_FORCE_MODE)
         if not np.isfinite(block["position"]).all():
             raise _Refusal(_PARAMETER)
-        for fault in self._lasting("refuse"):
+        for value in self._lasting("refuse"):
             if not block["mode"].any():  # It can still be turned off.
                 self._command(block)
-            raise _Refusal(fault.number)
+            raise _Refusal(value["number"])
         measured = self.plant.measure()
         hot = self._temperature(measured)
         self._hot = (hot > SHUTDOWN) | (self._hot & (hot > SHUTDOWN - 10.0))
         self._command(block)
-        self.angles = _angles(measured)
         return self.state(measured).tobytes()
 
-    def _lasting(self, kind: str) -> list[Fault]:
-        return [fault for _, fault in self.faults if fault.kind == kind]
+    def _lasting(self, kind: str) -> list[dict[str, Any]]:
+        return [values for _, name, values in self.faults if name == kind]
 
     def _temperature(self, measured: PlantMeasurement) -> np.ndarray:
         temperature = measured.temperature.copy()
-        for fault in self._lasting("heat"):
-            if fault.part.isdigit():
-                temperature[int(fault.part)] += fault.kelvin
+        for value in self._lasting("heat"):
+            temperature[value["joint"]] += value["kelvin"]
         return temperature
 
     def _command(self, block: np.ndarray) -> None:
-        """Set the motors; some may be too hot, off or blocked."""
+        """Set the motors; some may be too hot or off."""
         was_on = self.on
         block["mode"][self._hot] = Mode.PASSIVE
-        for fault in self._lasting("off"):
-            block["mode"][slice(None) if fault.joint == ALL else fault.joint] = Mode.PASSIVE
-        for fault in self._lasting("jam"):
-            block["position"][fault.joint] = fault.radians
+        for value in self._lasting("off"):
+            block["mode"][value["joint"]] = Mode.PASSIVE
         self.motors = block
         self.plant.drive(block)
         if was_on != self.on:
             self._note("motors on" if self.on else "motors off")
-
-
-def _angles(measured: PlantMeasurement) -> np.ndarray:
-    """True joint angles [12] rad, with the resolution of the encoders."""
-    return np.round(measured.joint_position / _TICK) * _TICK
 
 
 def _whole(values: np.ndarray, kind: type) -> np.ndarray:

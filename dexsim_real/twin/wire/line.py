@@ -8,14 +8,14 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 import contextlib
 import os
 import tty
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import numpy as np
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.faults import BYTES, Injector
+from dexsim_real.twin.wire.faults import LINE, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Parser
@@ -118,67 +118,59 @@ class HandLine:
         self.counts: Counter[str] = Counter()
         self._catch_up, self._note = catch_up, note
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
-        self._request: tuple[float, Frame] | None = None  # when the board has received and processed it (s)
-        self._answer: deque[tuple[float, bytes]] = deque()  # when due (s), chunk
-        self._back = np.inf  # s, end of a disconnection
-        self._deaf = -np.inf  # s, end of a time in which requests are ignored
-        self._heard = -np.inf
+        self._work: Generator[float, float, None] | None = None  # on a request; None while there is none
+        self._due, self._heard = np.inf, -np.inf
 
     def due(self) -> float:
         """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
-        if self._answer:
-            return min(self._answer[0][0], self._back)
-        return min(self._request[0] if self._request else np.inf, self._back)
+        return self._due
 
     def serve(self, now: float) -> None:
         """Do what is due."""
-        if now >= self._back:
-            self._back = np.inf
-            self.terminal.open()
-            self._note("reconnected")
-        if self.terminal.connected:
-            self._listen(now)
-        if self._request and self._request[0] <= now:
-            (due, frame), self._request = self._request, None
-            self._act(now, due, frame)
-        while self._answer and self._answer[0][0] <= now:
-            self.terminal.write(self._answer.popleft()[1])
+        for frame in self._listen(now) if self.terminal.connected else ():
+            self.counts["requests"] += 1
+            if self._work:  # It cannot listen and talk on one pair of wires.
+                self.counts["ignored"] += 1
+            else:
+                self._work = self._answer(now, frame)
+                self._due = next(self._work)
+        while self._work and self._due <= now:
+            try:
+                self._due = self._work.send(now)
+            except StopIteration:
+                self._work, self._due = None, np.inf
 
-    def _listen(self, now: float) -> None:
+    def _listen(self, now: float) -> list[Frame]:
         data = self.terminal.read()
         if not data:
             if now - self._heard > _SILENCE:
                 self._parser.expire()
-            return
+            return []
         self._heard = now
-        for frame in self._parser.feed(data):
-            self.counts["requests"] += 1
-            if now < self._deaf or self._request or self._answer:  # It cannot listen and talk on one pair of wires.
-                self.counts["ignored"] += 1
-            else:
-                extra = self._rng.uniform(0.0, EXTRA_DELAY) if self._rng.random() < EXTRA_PROBABILITY else 0.0
-                delay = max(PROCESSING + JITTER * self._rng.standard_normal(), 0.0) + extra
-                self._request = now + _on_wire(len(frame.encode())) + delay, frame
+        return self._parser.feed(data)
 
-    def _act(self, now: float, due: float, frame: Frame) -> None:
-        """Execute a request that the palm board has received at `due`, with at most one fault."""
+    def _answer(self, now: float, frame: Frame) -> Generator[float, float, None]:
+        """Execute and answer a request, with at most one fault; yields when it goes on (s), and gets the time."""
+        extra = self._rng.uniform(0.0, EXTRA_DELAY) if self._rng.random() < EXTRA_PROBABILITY else 0.0
+        delay = max(PROCESSING + JITTER * self._rng.standard_normal(), 0.0) + extra
+        due = now + _on_wire(len(frame.encode())) + delay
+        now = yield due
         fault = self.injector.sample(now) if frame.command == Command.EXCHANGE else None
         kind = fault.kind if fault else ""
-        if fault and kind not in BYTES:
-            self._note(f"fault {fault}")
+        if fault and kind != "flip":
+            self._note(f"fault {kind} {' '.join(f'{value:g}' for value in fault.values.values())}")
         if fault and kind == "disconnect":
-            self._back = now + fault.seconds
             self.terminal.close()
             self._parser.expire()
+            yield now + fault.values["seconds"]
+            self.terminal.open()
+            self._note("reconnected")
             return
         if fault and kind == "stall":
             self.counts["ignored"] += 1
-            self._deaf = now + fault.seconds
+            yield now + fault.values["seconds"]
             return
-        if fault and kind in BYTES and fault.side == "request":  # The board does not recognise it.
-            self.counts["damaged requests"] += 1
-            return
-        if fault and kind not in (*BYTES, "late"):
+        if fault and kind not in LINE:
             self.firmware.begin(fault, now)
         self._catch_up(now)
         answer = self.firmware.answer(frame, now)
@@ -186,13 +178,16 @@ class HandLine:
             return
         data = answer.encode()
         # From when it was due: a late machine catches up during the transfer.
-        start = max(due, now - _on_wire(len(data)) / 2) + (fault.seconds if fault and kind == "late" else 0.0)
-        if kind in BYTES:
-            data = self.injector.damage(kind, data)
-        self.counts["damaged answers" if kind in BYTES else "answers"] += 1
+        start = max(due, now - _on_wire(len(data)) / 2)
+        if fault and kind == "late":
+            start += fault.values["seconds"]
+        if kind == "flip":
+            data = self.injector.damage(data)
+        self.counts["damaged answers" if kind == "flip" else "answers"] += 1
         for at in range(0, len(data), CHUNK):
             chunk = data[at : at + CHUNK]
-            self._answer.append((start + _on_wire(at + len(chunk)), chunk))
+            yield start + _on_wire(at + len(chunk))
+            self.terminal.write(chunk)
 
 
 def _on_wire(size: int) -> float:

@@ -14,10 +14,10 @@ from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.link import HandPort, LinkCounts, Reply
 
 
-class Hand:
+class Hand(HandPort):
     """Answers at once, or not at all until a time; a clock of its own that every exchange moves on."""
 
     def __init__(self):

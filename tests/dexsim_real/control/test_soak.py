@@ -17,7 +17,7 @@ from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.link import HandPort, LinkCounts, Reply
 
 RARE = 1e-3  # probability in a cycle that the cable comes out, and that a run ends and another begins
 LENGTH = 30  # answers in which the angles of a fault are wrong, some or all
@@ -48,7 +48,7 @@ OTHERS = {hot: 1, current: 5, error_bits: 3, no_mode: 3, touch: 10}
 """Faults of what is no angle, and in how many answers each is."""
 
 
-class Faulty:
+class Faulty(HandPort):
     """`HandPort` of one hand whose answers are wrong for a share of the time, and its clock."""
 
     def __init__(self, hand, rng, share):

@@ -281,7 +281,7 @@ def test_a_command_that_is_not_finite_never_leaves(hand):
             sensing.command(np.where(np.arange(12) == 7, bad, 0.5), Mode.POSITION)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.lists(st.one_of(st.just(np.nan), st.just(np.inf), st.floats(-2, 2, width=32)), min_size=2, max_size=6))
 def test_a_second_thread_that_writes_any_target_puts_nothing_wrong_on_the_wire(hand, targets):
     bench, sensing, stop = Bench(hand), HandSensing(hand, HardwareConfig()), threading.Event()

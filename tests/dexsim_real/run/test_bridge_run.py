@@ -1,19 +1,17 @@
 """Runs of a policy on a scripted hand: whatever ends them, the motors go off."""
 
 import dataclasses
-import signal
-import subprocess
 import sys
 import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from paths import ROOT
 
 pytest.importorskip("serial")
 import memory_line
 from following_hand import FollowingHand, arguments, records, summary
+from scripted_driver import ScriptedDriver
 
 import dexsim_real
 from dexsim.calibration.maps import save_calibration
@@ -25,12 +23,11 @@ from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import limits_for
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind, LogReader
+from dexsim_real.core.log import Kind
 from dexsim_real.loop import TARE_SAMPLES
 from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.wire.driver import WITHOUT, DriverState
 from dexsim_real.wire.frames import Command, Frame
 from dexsim_real.wire.link import LinkConfig
 
@@ -167,7 +164,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
 def test_what_is_missing_is_said_in_one_line(tmp_path, capsys, options, says):
     with FollowingHand() as peer:
         port = peer.port if "--port" in options else str(tmp_path / "none")
-        words = ["grasp", "--port", port, "--quiet", "--link.settle", "0", "--link.no-paced"]
+        words = ["grasp", "--port", port, "--quiet", "--no-guard", "--link.settle", "0", "--link.no-paced"]
         words += [word for name, more in options.items() if more is not None for word in (name, *more)]
         with pytest.raises(SystemExit) as stop:
             cli.run(lambda _: run.main([*words, "--log", str(tmp_path / "a.log")]))
@@ -176,117 +173,60 @@ def test_what_is_missing_is_said_in_one_line(tmp_path, capsys, options, says):
         assert not peer.on().any()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTSTP, marks=pytest.mark.slow)])
-def test_signals(tmp_path, number):
-    with FollowingHand() as peer:
-        command = [sys.executable, "-m", "dexsim_real.run", *arguments(peer, tmp_path, "--seconds", "60")]
-        # As a shell starts what runs in the background: with Ctrl-C ignored.
-        process = subprocess.Popen(
-            ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *command], cwd=ROOT, stderr=subprocess.PIPE
-        )
-        try:
-            until = time.monotonic() + 60
-            while peer.on().sum() < 60 and process.poll() is None and time.monotonic() < until:
-                time.sleep(0.05)
-            sent = time.monotonic()
-            process.send_signal(number)
-            code = process.wait(20)
-        finally:
-            process.kill()
-        time.sleep(0.1)
-        on = peer.on()
-    assert code == 128 + number
-    assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
-    assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in records(tmp_path, Kind.END)[0]["end"]
-
-
-# --- as one call -----------------------------------------------------------------------------------
-
-
-def call(peer, folder, **options):
-    return dexsim_real.run_policy(
-        "grasp",
-        peer.port,
-        seconds=0.5,
-        yes=True,
-        fixed_object=True,
-        approach=0.4,
-        guard=False,
-        realtime=False,
-        quiet=True,
-        link=LinkConfig(settle=0.0, paced=False, margin=0.2),
-        safety=SafetyConfig(stale=1.0),
-        log=folder / "run.log",
-        **options,
-    )
-
-
 def test_one_call_runs_a_policy_and_says_how_it_went(tmp_path):
     with FollowingHand() as peer:
-        result = call(peer, tmp_path, command=0.7)
+        result = dexsim_real.run_policy(
+            "grasp",
+            peer.port,
+            seconds=0.5,
+            command=0.7,
+            yes=True,
+            fixed_object=True,
+            approach=0.4,
+            guard=False,
+            realtime=False,
+            quiet=True,
+            link=LinkConfig(settle=0.0, paced=False, margin=0.2),
+            safety=SafetyConfig(stale=1.0),
+            log=tmp_path / "run.log",
+        )
         assert peer.on().any() and not peer.on()[-1]
     assert (result.end, result.code, result.problem) == ("time is over", 0, "") and result.summary["motors_off"]
     assert result.summary["seconds"] >= 0.5 and result.summary["command"] == 0.7
-    assert result.log == tmp_path / "run.log"
-    ticks = [record for record in LogReader(result.log) if record.kind == Kind.TICK]
-    assert len(ticks) > 5
+    assert result.log == tmp_path / "run.log" and len(records(tmp_path, Kind.TICK)) > 5
 
 
-# --- over a driver of the user's own ---------------------------------------------------------------
+class Driver(ScriptedDriver):
+    """Answers until its trouble begins; its motors must stay off."""
 
-
-class Driver:
-    """Answers until its trouble begins."""
-
-    measures = frozenset(WITHOUT)
-
-    def __init__(self, trouble, after):
-        self.trouble, self.after, self.reads = trouble, after, 0
-
-    def connect(self):
-        return "a hand of mine"
-
-    def send(self, targets):
-        assert not targets.on
+    def __init__(self, hand, trouble, after):
+        super().__init__(hand)
+        self.trouble, self.reads, self.after = trouble, 0, after
 
     def read(self):
+        assert not any(targets.on for targets in self.sent)
         time.sleep(0.002)
         self.reads += 1
-        zero = np.zeros(12)
-        return (
-            self.trouble() if self.reads > self.after else DriverState(zero, zero > 0, zero, zero, np.zeros((5, 120)))
-        )
-
-    def close(self):
-        pass
+        return self.trouble(self.state) if self.reads > self.after else self.state
 
 
-@pytest.fixture
-def start(tmp_path, monkeypatch):
-    """Runs the command over a driver."""
-
-    def start(driver):
-        monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
-        return run.main(arguments(SimpleNamespace(port="sdk:my_sdk"), tmp_path))
-
-    return start
-
-
-def broken():
+def broken(state):
     raise RuntimeError("the SDK broke")
 
 
-def misshapen():
-    return DriverState(np.zeros(11), np.zeros(12, bool), *np.zeros((2, 12)), np.zeros((5, 120)))
+def misshapen(state):
+    return dataclasses.replace(state, position=np.zeros(11))
 
 
 @pytest.mark.parametrize(
     ("trouble", "says"), [(broken, "the SDK broke"), (misshapen, r"position has the shape \[11\]")]
 )
-def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(start, trouble, says):
+def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(hand, tmp_path, monkeypatch, trouble, says):
     """Not that the hand has stopped answering."""
+    driver = Driver(hand, trouble, after=TARE_SAMPLES)
+    monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
     with pytest.raises(HandError, match=f"the exchange thread failed: .*{says}"):
-        start(Driver(trouble, after=TARE_SAMPLES))
+        run.main(arguments(SimpleNamespace(port="sdk:my_sdk"), tmp_path))
 
 
 def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from dexsim_real.control.safety import Safety
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.link import HandPort, LinkCounts, Reply
 
 pytest.importorskip("serial")
 from following_hand import FollowingHand
@@ -119,7 +119,7 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
     """Before every exchange, and once more with the time that turning the motors off may take."""
     events = []
 
-    class Port:
+    class Port(HandPort):
         counts = LinkCounts()
 
         def exchange(self, command):

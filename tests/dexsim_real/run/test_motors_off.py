@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from paths import ROOT
 
@@ -23,9 +24,11 @@ from dexsim_real.wire.frames import empty_state, passive_command
 from dexsim_real.wire.link import Reply
 
 
-def runner(peer, folder, *more):
-    options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in more]
-    return subprocess.Popen([sys.executable, "-m", "dexsim_real.run", *options], cwd=ROOT, stderr=subprocess.PIPE)
+def runner(peer, folder, *without):
+    """As a shell starts what runs in the background: with Ctrl-C ignored."""
+    options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in without]
+    shell = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "dexsim_real.run"]
+    return subprocess.Popen([*shell, *options], cwd=ROOT, stderr=subprocess.PIPE)
 
 
 def wait(condition, seconds=60.0):
@@ -49,15 +52,20 @@ def moving(folder, *without):
             process.communicate()
 
 
-def test_signals_in_a_row_turn_the_motors_off(tmp_path):
-    """The second and later ones come while the first is handled."""
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTSTP, marks=pytest.mark.slow)])
+def test_signals_in_a_row_turn_the_motors_off(tmp_path, number):
+    """The second and later ones come while the first is handled, whose exit code it is."""
     with moving(tmp_path) as (peer, process):
-        for _ in range(3):
-            process.send_signal(signal.SIGTERM)
+        sent = time.monotonic()
+        for each in (number, signal.SIGTERM, signal.SIGTERM):
+            process.send_signal(each)
             time.sleep(random.uniform(0.001, 0.006))
-        assert process.wait(20) == 143
-        assert not peer.on()[-1]
-    assert summary(tmp_path)["motors_off"]
+        assert process.wait(20) == 128 + number
+        on = peer.on()
+        assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
+    report = summary(tmp_path)
+    assert report["motors_off"]
+    assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in report["end"]
 
 
 def test_only_the_first_signal_interrupts():
@@ -80,7 +88,7 @@ def test_only_the_first_signal_interrupts():
 
 
 def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
-    """Interrupted while the cable is out: the motors go off when it returns, 4 s later. The guard lets it try."""
+    """Interrupted while the cable is out: the motors go off when it returns, 2 s later. The guard lets it try."""
     with FollowingHand() as peer:
         process = runner(peer, tmp_path, "--no-guard")
         try:
@@ -88,7 +96,7 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
             peer.close()
             time.sleep(0.2)
             process.send_signal(signal.SIGINT)
-            time.sleep(4.0)
+            time.sleep(2.0)
             assert process.poll() is None
             peer.open()
             asked = len(peer.commands)

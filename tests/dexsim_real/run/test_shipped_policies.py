@@ -3,42 +3,40 @@
 import pytest
 
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
 
 
-@pytest.fixture(autouse=True)
-def jax_of_the_tests(monkeypatch):
-    """The flags that other tests compile with stay as they are."""
-    monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
-
-
-def trial(hand, name, seconds, command=0.5, shape="sphere"):
+@pytest.fixture
+def trial(hand, controller_of):
     """The referee's report of one trial on a nominal hand."""
-    policy = load_policy(name)
-    plant = EmulatedHand(hand, policy.task, 1, kind="nominal", seconds=seconds, trials=1, shape=shape)
-    controller = Controller(policy, hand)
-    controller.warm()
-    report = VirtualRun(plant, controller, ideal_calibration(hand), command).run()
-    assert report["bridge"]["latched"] == "", report
-    return report
+
+    def trial(name, seconds, command=0.5):
+        controller = controller_of(load_policy(name), hand)
+        controller.warm()
+        task = controller.policy.task
+        plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape="sphere")
+        report = VirtualRun(plant, controller, ideal_calibration(hand), command).run()
+        assert report["bridge"]["latched"] == "", report
+        return report
+
+    return trial
 
 
-def test_the_grasp_holds_and_presses_as_asked(hand):
-    """Force is judged from 3 s on."""
-    weak, strong = (trial(hand, "grasp", 4.0, command) for command in (0.0, 1.0))
+def test_the_grasp_holds_and_presses_as_asked(trial):
+    """Force is judged in the second half."""
+    weak, strong = (trial("grasp", 3.0, command) for command in (0.0, 1.0))
     assert weak["held"] and strong["held"]
     assert strong["finger_force"] > weak["finger_force"] + 1.5, (weak["finger_force"], strong["finger_force"])
 
 
 @pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation"])
-def test_a_rotation_policy_turns_the_cube(hand, name):
+def test_a_rotation_policy_turns_the_cube(trial, name):
     """Two quarter turns at least and no drop, by the referee and by the bridge's own count, which needs the IMU.
 
     `rotate_clear` is for another mount than the emulated hand's.
     """
-    report = trial(hand, name, 5.0)
+    report = trial(name, 4.0)
     assert not report["fell"] and report["successes"] >= 2, report
     if name == "rotate":
         assert report["bridge"]["successes"] >= 2, report

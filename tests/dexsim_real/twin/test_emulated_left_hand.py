@@ -1,15 +1,17 @@
 """The left hand on the bridge: shipped policies of the right one on an emulated left hand, in virtual time."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from dexsim.hand.load import load_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.control.controller import Controller
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.wire.frames import HOST, Command, Frame, palm_address
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, check_identity, read_identity
 
@@ -19,30 +21,22 @@ def left():
     return load_hand("xhand_left")
 
 
-def run(hand, name, seconds):
-    controller = Controller(load_policy(name), hand)
-    plant = EmulatedHand(hand, name, 0, kind="nominal", trials=1, seconds=seconds)
-    return VirtualRun(plant, controller, ideal_calibration(hand))
-
-
-def test_the_shipped_grasp_holds_on_the_left_hand(left):
-    report = run(left, "grasp", 3.0).run()
+def test_the_shipped_grasp_holds_on_the_left_hand(left, controller_of):
+    plant = EmulatedHand(left, "grasp", 0, kind="nominal", trials=1, seconds=2.0)
+    report = VirtualRun(plant, controller_of(load_policy("grasp"), left), ideal_calibration(left)).run()
     assert report["held"] and report["finger_force"] > 0.5 and report["bridge"]["latched"] == ""
 
 
-def test_the_emulated_hand_tells_its_side_and_the_other_is_refused(hand, left):
-    told = {}
-    for one in (hand, left):
-        board = run(one, "grasp", 1.0).port.firmware
-        contents = []
+def test_each_hand_tells_its_side_and_is_refused_with_the_model_of_the_other(hand, left):
+    for one, other in ((hand, left), (left, hand)):
+        board, contents = Firmware(SimpleNamespace(hand=one)), []
         for register in (SERIAL_NUMBER, SIDE):
             ask = Frame(HOST, palm_address(0), Command.READ_REGISTER, register.to_bytes(2, "little"))
             contents.append(board.answer(ask, 0.0).data[2:])
-        told[one.side] = read_identity(*contents)
-        assert check_identity(told[one.side], one) == []
-    for side, model in (("left", hand), ("right", left)):
-        with pytest.raises(HandError, match=f"this is a {side} hand .* the model a {model.side} one: see --hand"):
-            check_identity(told[side], model)
+        told = read_identity(*contents)
+        assert check_identity(told, one) == []
+        with pytest.raises(HandError, match=f"this is a {one.side} hand .* the model a {other.side} one: see --hand"):
+            check_identity(told, other)
 
 
 def test_the_left_hand_is_calibrated_by_the_same_presses(hand, left):

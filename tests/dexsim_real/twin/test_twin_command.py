@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 
 import numpy as np
@@ -19,7 +18,7 @@ from twin_plant import ScriptedPlant
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
-from dexsim_real.twin.server import PlantClock
+from dexsim_real.twin.__main__ import PlantClock
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, SERIALS
 
 
@@ -58,33 +57,27 @@ def start(*options):
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'support'}"},
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
-def test_the_command_ends_after_its_trials_and_writes_its_results(tmp_path):
-    options = "--task grasp --trials 2 --seconds 0.4 --output"
-    process = start(*options.split(), str(tmp_path / "out.json"))
-    out, error = process.communicate(timeout=300)
-    assert process.returncode == 0, error
-    shown, folder = out.decode(), tempfile.gettempdir()
-    assert f"python -m dexsim_real.run grasp --port {folder}/dexsim-twin-" in shown
-    assert f"--camera unix:{folder}/dexsim-twin-" in shown
-    report = json.loads((tmp_path / "out.json").read_text())
-    assert [row["trial"] for row in report["trials"]] == [0, 1] and report["line"] == {}
-    assert not os.path.lexists(shown.split("--port ")[1].split()[0])
-
-
-def test_it_offers_a_calibration_of_this_hand_and_ends_in_good_order_when_it_is_told_to(hand, tmp_path):
-    waiting = start("--folder", str(tmp_path), "--output", str(tmp_path / "out.json"))
-    assert waiting.stdout.readline().startswith(b"rotate: the emulated hand is at")
-    shown = waiting.stdout.readline().decode()
+def test_the_command_offers_a_calibration_and_ends_after_its_trials_or_when_it_is_told_to(hand, tmp_path):
+    ends = start(*"--task grasp --trials 2 --seconds 0.4 --output".split(), str(tmp_path / "out.json"))
+    waits = start("--folder", str(tmp_path), "--output", str(tmp_path / "waits.json"))
+    assert waits.stdout.readline().startswith("rotate: the emulated hand is at")
+    shown = waits.stdout.readline()
+    assert f"--imu {tmp_path}/imu" in shown
     calibration = load_calibration(shown.split("--calibration ")[1].split()[0], hand)
     np.testing.assert_allclose(calibration.force_per_count, FORCE_PER_COUNT)
     assert (calibration.serial, calibration.handedness) == (SERIALS["right"], "right")
-    waiting.send_signal(signal.SIGTERM)
-    assert waiting.wait(10) == 0 and (tmp_path / "out.json").exists() and not (tmp_path / "hand").is_symlink()
-    waiting.communicate()
+    waits.send_signal(signal.SIGTERM)
+    assert waits.wait(10) == 0 and (tmp_path / "waits.json").exists() and not (tmp_path / "hand").is_symlink()
+    waits.communicate()
+    shown, _ = ends.communicate(timeout=300)
+    assert ends.returncode == 0 and "python -m dexsim_real.run grasp --port " in shown and "--camera unix:" in shown
+    report = json.loads((tmp_path / "out.json").read_text())
+    assert [row["trial"] for row in report["trials"]] == [0, 1] and report["line"] == {}
+    assert not os.path.lexists(shown.split("--port ")[1].split()[0])
 
 
 def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):

@@ -11,8 +11,7 @@ from emulated_plant import free
 from paths import ROOT
 
 from dexsim.calibration.maps import normalised_torque
-from dexsim.registry import make_task
-from dexsim.task_spec import TaskSpec
+from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.sensors.imu import IDENTITY
@@ -30,7 +29,7 @@ class Scripted:
     period = 0.03
 
     def __init__(self, hand, task, script, sources=()):
-        self.hand, self.spec = hand, TaskSpec.of(make_task(task, hand))
+        self.hand, self.spec = hand, load_policy(task).spec
         self.sources, self._script, self.seen = set(sources), script, []
 
     def start(self, target):
@@ -52,38 +51,28 @@ def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
 
 
 def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
-    run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4))
+    """With one target that is too far away; an exchange begins every 12 ms, and its answer is there 9.6 ms later."""
+    far = 0.8 * (np.arange(12) == 4)
+    run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
+    update, heard = run.safety.update, []
+    run.safety.update = lambda sample: heard.append(sample.time) or update(sample)
     report = run.run()
     assert report["end"] == "time limit" and report["seconds"] == pytest.approx(0.5) and report["command"] == 0.25
     assert report["bridge"]["successes"] == run.policy.goals.successes == 0
+    assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
     assert abs(len(controller.seen) * controller.period - 0.5) < 0.15
     exchanges = run.port.firmware.counts["exchange"]
     assert exchanges == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
+    assert heard[0] == pytest.approx(0.0096) and np.ptp(np.diff(heard)[40:] - 1 / RATE) < 1e-9
     measured = controller.seen[-1][0]
     # What the policy sees has the wire's steps: 12 bits a turn, 0.1 N, 1 mA.
-    steps = measured.joint_position / (2 * math.pi / 4096)
-    assert steps == pytest.approx(np.round(steps), abs=1e-2)
-    assert measured.taxel_force * 10 == pytest.approx(np.round(measured.taxel_force * 10), abs=1e-4)
-    assert measured.current * 1000 == pytest.approx(np.round(measured.current * 1000), abs=1e-3)
+    for values, step in (
+        (measured.joint_position, 2 * math.pi / 4096),
+        (measured.taxel_force, 0.1),
+        (measured.current, 0.001),
+    ):
+        assert values / step == pytest.approx(np.round(values / step), abs=1e-2)
     assert json.loads(json.dumps(report)) == report
-
-
-def test_measurements_are_as_old_as_the_exchange_makes_them(hand):
-    """An exchange begins every 12 ms, and its answer is there 9.6 ms later."""
-    run, plant, _ = virtual(hand, "rotate", lambda k, target: target + 0.01, seconds=0.1)
-    heard = []
-    update = run.safety.update
-    run.safety.update = lambda sample: (heard.append((sample.time, plant.time)), update(sample))
-    run.run()
-    times = np.array([time for time, _ in heard])
-    assert times[0] == pytest.approx(0.0096)
-    assert np.diff(times)[40:] == pytest.approx(np.full(len(times) - 41, 1 / RATE), abs=1e-9)  # after the tare
-
-
-def test_an_unsafe_wish_is_clipped(hand):
-    run, _, _ = virtual(hand, "rotate", lambda k, target: target + 0.8 * (np.arange(12) == 4), seconds=0.15)
-    run.run()
-    assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
 
 
 def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
@@ -101,10 +90,12 @@ def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
 
 
 def test_the_camera_measures_the_height(hand):
+    spec = load_policy("grasp").spec
+    reference = np.array(spec.reference)
     for shape in SHAPES:
         plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape=shape)
-        port, spec = VirtualPort(plant), TaskSpec.of(make_task("grasp", hand))
-        camera, reference = virtual_camera(port, spec), np.array(spec.reference)
+        port = VirtualPort(plant)
+        camera = virtual_camera(port, spec)
         free(plant, reference + (0.01, 0.0, 0.0))
         port.sleep(0.002)
         _, position, _ = camera.read()
@@ -133,12 +124,9 @@ def benchmark():
 
 
 def test_metrics_of_rotations(benchmark):
-    rows = ((0, 3.0), (10, 60.0), (50, 120.0))
-    reports = [
-        {"successes": s, "paper_successes": s + 1, "seconds_to_fall": t, "fell": t < 120, "joint_speed": 0.5}
-        for s, t in rows
-    ]
-    metrics = benchmark.rotate_metrics(reports)
+    keys = ("successes", "paper_successes", "seconds_to_fall", "fell", "joint_speed")
+    rows = ((0, 1, 3.0, True, 0.5), (10, 11, 60.0, True, 0.5), (50, 51, 120.0, False, 0.5))
+    metrics = benchmark.rotate_metrics([dict(zip(keys, row, strict=True)) for row in rows])
     assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
     assert metrics["seconds_to_fall"]["mean"] == 61.0
     assert metrics["successes_per_minute"]["mean"] == pytest.approx(60 / (183 / 60))  # stuck or not
@@ -148,23 +136,14 @@ def test_metrics_of_rotations(benchmark):
 
 
 def test_metrics_of_grasps_count_only_what_was_held(benchmark):
-    reports = [
-        {
-            "held": held,
-            "command": c,
-            "finger_force": 2 + 5 * c,
-            "finger_normal": (1 + c) ** 2,
-            "finger_taxels": 1 - c,
-            "total_force": 9 + c,
-            "total_torque": 0.5 + c,
-            "torque_limited": 0.6 * (c == 1),
-            "seconds": 8.0 if held else 5.5,
-            "window_s": [3.0, 8.0],
-            "shape": shape,
-        }
-        for c in (0.0, 0.5, 1.0)
-        for shape, held in (("box", True), ("sphere", c < 1))
-    ]
+    def report(c, shape, held):
+        forces = {"force": 2 + 5 * c, "normal": (1 + c) ** 2, "taxels": 1 - c}
+        report = {f"finger_{name}": value for name, value in forces.items()}
+        report |= {"total_force": 9 + c, "total_torque": 0.5 + c, "torque_limited": 0.6 * (c == 1)}
+        time = {"seconds": 8.0 if held else 5.5, "window_s": [3.0, 8.0]}
+        return report | time | {"held": held, "command": c, "shape": shape}
+
+    reports = [report(c, shape, held) for c in (0.0, 0.5, 1.0) for shape, held in (("box", True), ("sphere", c < 1))]
     metrics = benchmark.grasp_metrics(reports, (2.0, 7.0))
     assert metrics["held"]["mean"] == pytest.approx(5 / 6)
     assert metrics["r_resultant"]["r"] == pytest.approx(1.0) and metrics["r_taxels"]["r"] == pytest.approx(-1.0)
@@ -180,13 +159,15 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
 def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):
     torque = np.zeros(12)
     torque[hand.root_joint] = (0.5, -0.3, 0.2, 0.1, 0.4)
-    force = np.array([1.0, 2.0, 0.0, 3.0, 0.0])
-
-    def entry(time, factor):
-        tick = SimpleNamespace(readings=SimpleNamespace(joint_torque=factor * torque))
-        return {"time": time, "tick": tick, "measured": SimpleNamespace(finger_force=force)}
-
-    trace = [entry(10.0, 9.0), entry(12.9, 9.0), entry(13.5, 1.0), entry(15.0, 2.0), entry(18.0, 9.0)]
+    measured = SimpleNamespace(finger_force=np.array([1.0, 2.0, 0.0, 3.0, 0.0]))
+    trace = [
+        {
+            "time": time,
+            "tick": SimpleNamespace(readings=SimpleNamespace(joint_torque=k * torque)),
+            "measured": measured,
+        }
+        for time, k in ((10.0, 9.0), (12.9, 9.0), (13.5, 1.0), (15.0, 2.0), (18.0, 9.0))
+    ]
     assert benchmark._measured_torque(trace, hand, [3.0, 8.0]) == pytest.approx(1.5 * (0.5 + 0.3 + 0.1))
     assert benchmark._measured_torque(trace[:2], hand, [3.0, 8.0]) == 0.0
 
@@ -195,6 +176,6 @@ def test_both_worlds_name_forces_alike(benchmark):
     """What the referee reports is what the task's report reduces, name by name."""
     from dexsim.tasks.grasp.report import FORCES, window
 
-    judge = Referee("grasp")
+    judge = Referee("grasp", np.zeros(3))
     assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
     assert judge.window == window(judge.limit) == (3.0, 8.0)

@@ -62,43 +62,34 @@ def test_one_request_one_answer():
     assert port.counts.sent == 5 == port.counts.answered
 
 
+def flipped(state, whole):
+    return whole[:1000] + bytes([whole[1000] ^ 4]) + whole[1001:]
+
+
+def misnumbered(state, whole):
+    state["joint"]["id"][5] = 4
+    return Frame(0x80, 0xFE, Command.EXCHANGE, state.tobytes()).encode()
+
+
 FAULTS = {
-    "flip": "corrupt",
-    "cut": "corrupt",
-    "noise": "corrupt",
-    "nothing": "silent",
-    "error": "refused",
-    "ids": "corrupt",
-    "another hand": "corrupt",
+    flipped: "corrupt",
+    misnumbered: "corrupt",
+    (lambda state, whole: whole[:700] + whole[760:]): "corrupt",
+    (lambda state, whole: b"\x55\xaa" * 50): "corrupt",
+    (lambda state, whole: b""): "silent",
+    (lambda state, whole: Frame(0x80, 0xFE, Command.ERROR, b"\x46\x00").encode()): "refused",
+    (lambda state, whole: Frame(0x81, 0xFE, Command.EXCHANGE, state.tobytes()).encode()): "corrupt",  # another hand's
 }
 
 
 def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
-    plan = [name for name in FAULTS for _ in range(2)]
+    plan = [fault for fault in FAULTS for _ in range(2)]
 
     def answer(index, block, state):
-        if index == 0 or index > 2 * len(plan) or index % 2 == 0:
+        if index % 2 == 0:
             state["joint"]["position"] = index
             return None
-        fault = plan[index // 2]
-        whole = bytearray(peer.whole())
-        if fault == "flip":
-            whole[1000] ^= 4
-        elif fault == "cut":
-            del whole[700:760]
-        elif fault == "noise":
-            whole = bytearray(b"\x55\xaa" * 50)
-        elif fault == "nothing":
-            whole = bytearray()
-        elif fault == "error":
-            whole = bytearray(Frame(0x80, 0xFE, Command.ERROR, b"\x46\x00").encode())
-        elif fault == "another hand":
-            whole = bytearray(Frame(0x81, 0xFE, Command.EXCHANGE, state.tobytes()).encode())
-        else:
-            bad = state.copy()
-            bad["joint"]["id"][5] = 4
-            whole = bytearray(Frame(0x80, 0xFE, Command.EXCHANGE, bad.tobytes()).encode())
-        return bytes(whole)
+        return plan[index // 2](state.copy(), peer.whole())
 
     with PtyHand(answer) as peer:
         port = SerialHand(peer.port, QUICK)
@@ -106,9 +97,9 @@ def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
         before = outcomes(port.counts)
         expected = dict.fromkeys(before, 0)
         for index, fault in enumerate(plan):
-            assert port.exchange(command()) is None, fault
+            assert port.exchange(command()) is None, index
             reply = port.exchange(command())
-            assert reply is not None and reply.state["joint"]["position"][0] == 2 * index + 2, fault
+            assert reply is not None and reply.state["joint"]["position"][0] == 2 * index + 2, index
             expected[FAULTS[fault]] += 1
             expected["answered"] += 1
         after = outcomes(port.counts)

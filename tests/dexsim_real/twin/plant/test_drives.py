@@ -75,13 +75,6 @@ def test_commands_reach_each_board_after_its_own_delay(hand):
     assert reached == pytest.approx(0.005 + np.ceil(made.delay / PERIOD - 1e-6) * PERIOD, abs=1e-9)
 
 
-def test_passive_motors_give_nothing(hand):
-    made = drives(hand)
-    made.send(0.0, motors(1.0, mode=Mode.PASSIVE))
-    torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
-    assert not torque.any() and not made.current.any()
-
-
 def steady(heat, current):
     """Winding and case, degC, after a current A has flowed for ever: the loss grows with the winding's temperature."""
     power, path = current**2 * heat.resistance, heat.to_case + heat.to_air
@@ -108,7 +101,8 @@ def test_heat_settles_where_loss_and_flow_balance(hand):
 
 def test_a_drive_is_at_its_limit_where_it_asks_for_more(hand):
     made = drives(hand)
-    assert not made.at_limit().any()
+    torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
+    assert not torque.any() and not made.current.any() and not made.at_limit().any()
     step = np.where(np.arange(12) % 2, 1.0, 0.01)  # 3 Nm and 0.03 Nm; they stall at 1.1 and 0.4 Nm
     for sign in (1, -1):
         made.send(0.0, motors(sign * step))

@@ -11,7 +11,7 @@ from emulated_plant import free, motors, world
 
 from dexsim.randomization import tilted_down
 from dexsim_real.twin.plant import emulated_hand, scene
-from dexsim_real.twin.plant.assistant import GRAVITY, POSTURES, Assistant, Stage, nominal_gravity, put, tilted_gravity
+from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, nominal_gravity, put, tilted_gravity
 from dexsim_real.twin.plant.drives import PERIOD
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
@@ -101,7 +101,7 @@ def test_a_gear_with_play_loses_that_much_motion(hand, monkeypatch):
     plant = world(hand, gear_play=play, gear_stiffness=150.0)
     plant._scene.model.opt.gravity[:] = 0.0
     free(plant, (0.5, 0.0, 0.0))  # out of the fingers' way
-    posture = np.array(POSTURES["rotate"])
+    posture = np.array(hand.rotate_posture)
     plant._data.qpos[plant._scene.drive_qpos] = posture
     plant.drive(motors(posture))
     gap, rotor = [], []
@@ -131,7 +131,7 @@ def test_currents_are_reported_in_milliamperes_positive_when_opening(hand):
 
 def test_readings_are_as_old_as_drawn(hand):
     plant = world(hand, sensing_latency=0.0146 + 0.01, encoder_noise=0.0)
-    plant.drive(motors(POSTURES["rotate"]))
+    plant.drive(motors(hand.rotate_posture))
     shown, true = [], []
     for _ in range(60):
         plant.advance(PERIOD)
@@ -144,9 +144,9 @@ def test_readings_are_as_old_as_drawn(hand):
 def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
     def run(seed, first=0):
         plant = EmulatedHand(hand, "grasp", seed, first=first, overrides={"reaction": 0.0})
-        plant.drive(motors(POSTURES["grasp"]))
+        plant.drive(motors(hand.grasp_posture))
         plant.advance(1.2)
-        plant.drive(motors(np.array(POSTURES["grasp"]) + 0.1))
+        plant.drive(motors(np.array(hand.grasp_posture) + 0.1))
         plant.advance(0.3)
         shown = plant.measure()
         return np.concatenate([np.ravel(getattr(shown, f.name)) for f in dataclasses.fields(shown)]), plant.results()
@@ -160,7 +160,7 @@ def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
 
 def test_the_object_is_held_until_the_targets_move_on(hand):
     plant = EmulatedHand(hand, "rotate", 2, trials=1)
-    posture = np.array(POSTURES["rotate"])
+    posture = np.array(hand.rotate_posture)
     at = plant._scene.object_qpos
     plant.drive(motors(posture + 0.1))
     plant.advance(0.3)
@@ -183,8 +183,8 @@ def test_the_object_is_held_until_the_targets_move_on(hand):
     assert len(plant.results()) == 1
 
 
-def test_motors_that_go_off_take_the_object_back():
-    helper, posture = Assistant(POSTURES["rotate"]), np.array(POSTURES["rotate"])
+def test_motors_that_go_off_take_the_object_back(hand):
+    helper, posture = Assistant(hand.rotate_posture), np.array(hand.rotate_posture)
     for time, targets, stage in (
         (0.0, posture, Stage.HOLD),
         (0.1, None, Stage.AWAY),
@@ -198,7 +198,7 @@ def test_places_are_clear_of_the_hand(hand):
     for seed in range(12):
         plant = EmulatedHand(hand, "grasp", seed)
         data = mujoco.MjData(plant._scene.model)
-        data.qpos[plant._scene.drive_qpos] = POSTURES["grasp"]
+        data.qpos[plant._scene.drive_qpos] = hand.grasp_posture
         put(plant._scene, data, plant._place.position, plant._place.quat)
         mujoco.mj_forward(plant._scene.model, data)
         touching = plant._scene.is_object[data.contact.geom].any(-1)

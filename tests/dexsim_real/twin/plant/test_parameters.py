@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
@@ -11,12 +10,11 @@ import pytest
 from paths import ROOT
 
 import dexsim_real.twin.plant
-from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand, referee
-from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, nominal_gravity
+from dexsim_real.twin.plant.assistant import ROTATE_PLACE, nominal_gravity, start_of
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import FAR, NEAR, PUSHES, TASKS, bands, sample_trial
 
@@ -47,12 +45,11 @@ def test_fingertips_and_friction_follow_nothing_of_training():
 
 
 @pytest.mark.parametrize("task", SKILLS)
-def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
-    header = json.loads(Path(asset_path(f"policies/{task}.json")).read_text())
-    assert header["task"] == task
+def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_policies(hand, task):
     from dexsim_ppo.policy import load_policy
 
-    for config in (to_dict(TRAINED[task].config_class()), load_policy(task).env_config):
+    shipped = load_policy(task).env_config
+    for config in (to_dict(TRAINED[task].config_class()), shipped):
         for name, band in trained_bands(task).items():
             trained = _lookup(config, band.origin)
             low, high = (
@@ -69,25 +66,15 @@ def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
         )
         assert referee.LOST[task] == config["drop_distance"]
         assert referee.LIMITS[task] == config["evaluation_seconds"]
-
-
-def test_rules_and_places_are_those_of_the_tasks(hand):
-    from dexsim_ppo.policy import load_policy
-
-    for task in SKILLS:
-        rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
-        assert REFERENCES[task] == pytest.approx(rules.reference)
-        assert POSTURES[task] == pytest.approx(rules.config.posture)
-        assert POSTURES[task] == pytest.approx(load_policy(task).env_config["posture"])
-        assert nominal_gravity(task) == pytest.approx(rules.gravity)
-    config = rules.config
-    assert (
-        referee.GOAL_STEP,
-        referee.GOAL_ANGLE,
-        referee.GOAL_DISTANCE,
-        referee.GOAL_SPIN,
-        referee.TIPPED,
-    ) == pytest.approx((config.turn.step, config.turn.angle, config.turn.distance, config.turn.spin, config.drop_tilt))
+    rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
+    start = start_of(hand, task)
+    assert start.reference == pytest.approx(rules.reference)
+    assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
+    assert nominal_gravity(task) == pytest.approx(rules.gravity)
+    if task == "rotate":
+        turn = rules.config.turn
+        ours = (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
+        assert ours == pytest.approx((turn.step, turn.angle, turn.distance, turn.spin, rules.config.drop_tilt))
 
 
 def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
@@ -95,7 +82,7 @@ def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_
     entry = TRAINED["rotate"]
     rules = entry.task(dataclasses.replace(entry.config_class(), pool_size=64), hand)
     starts = rules.make_pool(jax.random.key(0)).qpos[:, 13:15]
-    assert np.all(np.abs(starts.mean(0) - PLACES["rotate"]) < 0.6 * starts.std(0))
+    assert np.all(np.abs(starts.mean(0) - ROTATE_PLACE) < 0.6 * starts.std(0))
 
 
 def test_the_fingers_leave_room_where_a_cube_is_put(hand, monkeypatch):
@@ -136,13 +123,13 @@ def test_inside_nominal_and_overrides():
 
 
 def test_the_physics_shares_no_code_with_training():
-    """Every module of the folder: of `dexsim` it takes the type of a hand's model and the walk along its bodies, of JAX
-    nothing."""
+    """Every module of the folder: of `dexsim` it takes the type of a hand's model, its MJCF and the walk along its
+    bodies, of JAX nothing."""
     folder = Path(dexsim_real.twin.plant.__file__).parent
     paths = sorted(folder.rglob("*.py"))
     ours = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths}
     assert "dexsim_real.twin.plant.emulated_hand" in ours and len(ours) > 9
-    kinematics = ("dexsim.hand.description.Hand", "dexsim.hand.kinematics.finger_bodies")
+    hand = ("description.Hand", "kinematics.finger_bodies", "mjcf.read_mjcf")
     bridge = {"dexsim_real.wire.frames", "dexsim_real.core.errors", *ours}
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -152,6 +139,6 @@ def test_the_physics_shares_no_code_with_training():
                 package = name.split(".")[0]
                 assert package not in ("jax", "dexsim_ppo", "importlib"), f"{path.name} imports {name}"
                 assert "mjx" not in name
-                assert package != "dexsim" or name in kinematics, f"{path.name}: {name}"
+                assert package != "dexsim" or name.removeprefix("dexsim.hand.") in hand, f"{path.name}: {name}"
                 if package == "dexsim_real":
                     assert name in bridge or name.rpartition(".")[0] in bridge, f"{path.name}: {name}"

@@ -8,7 +8,7 @@ from emulated_plant import IDEAL, QUIET, free, motors
 from dexsim.core.assets import asset_path
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand
-from dexsim_real.twin.plant.assistant import GRAVITY, POSTURES, Stage
+from dexsim_real.twin.plant.assistant import GRAVITY, Stage
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.hand_model import read_model
 from dexsim_real.twin.plant.parameters import sample_trial
@@ -76,11 +76,6 @@ def test_what_does_not_fit_is_an_error_in_one_line(hand, text, write, old, new, 
     with pytest.raises(HandError) as error:
         read_model(path, hand)
     assert says in str(error.value) and str(path) in str(error.value) and "\n" not in str(error.value)
-
-
-def test_a_parameter_that_the_file_decides_cannot_be_set(hand):
-    with pytest.raises(HandError, match="friction is not a parameter of a plant model"):
-        plant(hand, friction=0.5)
 
 
 def test_a_site_is_the_palm_and_a_tip_is_found_by_its_name(hand, text, write):
@@ -179,7 +174,7 @@ def test_a_contact_loads_the_nearest_taxels_with_all_of_its_force(hand):
 
 def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand):
     ours = plant(hand, task="grasp", shape="box", reaction=0.3)
-    posture = np.array(POSTURES["grasp"])
+    posture = np.array(hand.grasp_posture)
     ours.drive(motors(posture))
     ours.advance(0.6)
     assert ours.stage is Stage.HOLD
@@ -187,6 +182,8 @@ def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand)
     ours.advance(0.5)
     report, felt = ours.results()[0], ours.measure().taxel_force[..., 2].sum(-1)
     assert report["plant"] == "foreign_right.xml" and "friction" not in report["parameters"]
+    with pytest.raises(HandError, match="friction is not a parameter of a plant model"):
+        plant(hand, friction=0.5)
     strength = np.zeros(5)
     for contact in ours._touches:
         strength[contact.finger] += np.linalg.norm(contact.normal)

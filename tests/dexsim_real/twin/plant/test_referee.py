@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from dexsim_real.twin.plant import referee
-from dexsim_real.twin.plant.assistant import REFERENCES
 from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.shapes import product, turn
+
+PLACE = np.array((0.047, 0.024, 0.088))  # nominal, of the object
 
 
 def seen(position, quat=(1.0, 0, 0, 0), spin=0.0, force=0.0, limited=False, disturbed=False):
@@ -29,11 +30,11 @@ def seen(position, quat=(1.0, 0, 0, 0), spin=0.0, force=0.0, limited=False, dist
 
 def look(judge, quat, spin=0.0, away=0.0, step=0.01):
     """One look at a cube that nobody touches, `away` m from its nominal position."""
-    judge.watch(step, seen(np.array(REFERENCES["rotate"]) + (away, 0, 0), quat, spin))
+    judge.watch(step, seen(PLACE + (away, 0, 0), quat, spin))
 
 
 def spinning(rate, seconds, heading=0.05, step=0.01):
-    judge = Referee("rotate")
+    judge = Referee("rotate", PLACE)
     for k in range(round(seconds / step) + 1):
         look(judge, turn((1, 0, 0), heading + rate * k * step), rate)
     return judge.goals["task"], judge.goals["paper"]
@@ -49,7 +50,7 @@ def test_goals_of_a_steady_turn():
 
 
 def test_a_goal_needs_the_whole_orientation_and_the_place():
-    judge, quarter = Referee("rotate"), turn((1, 0, 0), math.pi / 2)
+    judge, quarter = Referee("rotate", PLACE), turn((1, 0, 0), math.pi / 2)
     look(judge, turn((1, 0, 0), 0.0))
     look(judge, quarter, away=0.06)
     look(judge, product(turn((0, 0, 1), 0.35), quarter))
@@ -60,7 +61,7 @@ def test_a_goal_needs_the_whole_orientation_and_the_place():
 
 def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0), limited=0.0, push=()):
     """A trial with a look each 10 ms; `limited`: share of looks with a joint at its limit, `push`: when one acts."""
-    judge = Referee(task, seconds)
+    judge = Referee(task, PLACE, seconds)
     for k, position in enumerate(positions):
         force, now = (part(k) if callable(part) else part for part in (tips, quat))
         judge.watch(0.01, seen(position, now, 0.0, force, k % 10 < 10 * limited, k in push))
@@ -68,38 +69,36 @@ def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0), lim
 
 
 def test_drops_and_their_causes():
-    place = np.array(REFERENCES["rotate"])
-    away = [place] * 50 + [place + (0, 0, -0.071)]
+    away = [PLACE] * 50 + [PLACE + (0, 0, -0.071)]
     slipped = watched("rotate", away, tips=lambda k: 1.0 if k < 20 else 0.0).report()
     assert slipped["end"] == "dropped: slipped" and slipped["seconds_to_fall"] == pytest.approx(0.51)
     assert slipped["fell"]
     assert slipped["joint_speed"] == pytest.approx(0.5)
-    assert slipped["before"]["object_position"] == pytest.approx(place, abs=1e-4)
+    assert slipped["before"]["object_position"] == pytest.approx(PLACE, abs=1e-4)
     assert watched("rotate", away, tips=1.0).end == "dropped: pushed out"
     assert watched("rotate", away).end == "dropped: untouched"
     assert watched("rotate", away, tips=1.0, limited=0.8).end == "dropped: at the torque limit"
     assert watched("rotate", away, tips=1.0, limited=0.2, push=range(10, 20)).end == "dropped: disturbed"
     over = lambda k: turn((0, 1, 0), 1.05 if k == 50 else 0.0)  # noqa: E731
-    assert watched("rotate", [place] * 51, quat=over, tips=1.0).end == "dropped: tipped"
+    assert watched("rotate", [PLACE] * 51, quat=over, tips=1.0).end == "dropped: tipped"
     lean = lambda k: turn((0, 1, 0), 0.0 if k < 100 else 0.6 if k < 350 else 1.05)  # noqa: E731
     middle = lambda k: (np.arange(5) == 2) * 12.0 if k >= 100 else 1.0  # noqa: E731
-    assert watched("rotate", [place] * 351, quat=lean, tips=middle).end == "dropped: trapped"
-    assert watched("rotate", [place] * 351, quat=lean, tips=1.0).end == "dropped: tipped"
-    kept = watched("rotate", [place] * 300, seconds=2.0).report()
+    assert watched("rotate", [PLACE] * 351, quat=lean, tips=middle).end == "dropped: trapped"
+    assert watched("rotate", [PLACE] * 351, quat=lean, tips=1.0).end == "dropped: tipped"
+    kept = watched("rotate", [PLACE] * 300, seconds=2.0).report()
     assert kept["end"] == "time limit" and not kept["fell"] and kept["seconds"] == pytest.approx(2.0)
     assert "before" not in kept
 
 
 def test_forces_of_a_grasp_are_means_from_three_seconds_on():
-    place = np.array(REFERENCES["grasp"])
-    judge = Referee("grasp")
+    judge = Referee("grasp", PLACE)
     for k in range(801):
         force = np.array((9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else [50.0] * 5)
-        judge.watch(0.01, seen(place, force=force, limited=k % 4 == 0))
+        judge.watch(0.01, seen(PLACE, force=force, limited=k % 4 == 0))
     report = judge.report()
     assert report["held"] and report["force"] == pytest.approx([9.0, 1.0, 2.0, 0.0, 3.0])
     assert report["finger_force"] == pytest.approx(2.0) and report["total_force"] == pytest.approx(15.0)
     assert report["finger_normal"] == pytest.approx(1.6) and report["finger_taxels"] == pytest.approx(1.0)
     assert report["torque_limited"] == pytest.approx(0.25) and report["window_s"] == [3.0, 8.0]
-    lost = watched("grasp", [place + (0.121, 0, 0)]).report()
+    lost = watched("grasp", [PLACE + (0.121, 0, 0)]).report()
     assert not lost["held"] and lost["end"].startswith("dropped")

@@ -57,13 +57,10 @@ def test_mass_properties_of_a_box():
     assert sorted(model.body_inertia[1]) == pytest.approx(sorted(1.2 * 0.1 * (square.sum() - square)))
 
 
-def test_all_shapes_are_drawn():
+def test_all_shapes_are_drawn_and_for_rotate_any_boxes_and_upright_cylinders():
     parameters = sample_trial("grasp", np.random.default_rng(0))
     drawn = {shapes.sample_shape(parameters, np.random.default_rng(k)).name for k in range(60)}
     assert drawn == set(shapes.SHAPES)
-
-
-def test_rotate_any_draws_boxes_and_upright_cylinders():
     drawn = [
         shapes.sample_shape(sample_trial("rotate_any", np.random.default_rng(k)), np.random.default_rng(k))
         for k in range(40)

@@ -21,7 +21,7 @@ from dexsim_real.twin.wire import emulated_sensors
 def test_the_bridges_imu_reader_sees_how_the_object_turns(tmp_path):
     plant = ScriptedPlant(turn=2.0)
     with Running(tmp_path, plant, task="rotate") as running:
-        reader = imu.Imu(str(running.twin.imu.terminal.name))
+        reader = imu.Imu(str(running.twin.sensor.terminal.name))
         reader.wait()
         joined = reader.parser.damaged  # The port may be opened within a frame, whose rest can look like a head.
         half = 0.5 * plant.turn * plant.time
@@ -31,7 +31,7 @@ def test_the_bridges_imu_reader_sees_how_the_object_turns(tmp_path):
             time.sleep(0.02)
             seen.append((plant.time, reader.read()[1]))
         reader.close()
-        sent, passed = running.twin.imu.frames.sent, plant.time
+        sent, passed = running.twin.sensor.frames.sent, plant.time
     for when, quat in seen:
         off = 2 * math.acos(min(1.0, abs(quat @ [math.cos(when), math.sin(when), 0, 0])))
         assert off < 0.15  # What it turns in the time that this busy test takes to look.
@@ -63,14 +63,14 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
 
 def test_the_bridges_camera_sees_the_object(tmp_path):
     with Running(tmp_path, task="grasp", seed=3) as running:
-        masks = open_masks(f"unix:{running.twin.masks.path}", OPTICS)
+        masks = open_masks(f"unix:{running.twin.sensor.path}", OPTICS)
         sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
         begin = time.monotonic()
-        while not sensor.has_measurement or running.twin.masks.sent < 10:
+        while not sensor.has_measurement or running.twin.sensor.sent < 10:
             time.sleep(0.01)
         when, position, _ = sensor.read()
         assert position[0] == pytest.approx(0.047, abs=0.002) and when <= time.monotonic()
         sensor.close()
-        assert running.twin.masks.sent <= 2 + 1.1 * emulated_sensors.CAMERA_RATE * (time.monotonic() - begin)
+        assert running.twin.sensor.sent <= 2 + 1.1 * emulated_sensors.CAMERA_RATE * (time.monotonic() - begin)
     with pytest.raises(HandError, match="no program sends masks"):
-        open_masks(f"unix:{running.twin.masks.path}", OPTICS)
+        open_masks(f"unix:{running.twin.sensor.path}", OPTICS)

@@ -1,7 +1,6 @@
 """The emulated palm board: answers, quantisation, protection."""
 
 import math
-import struct
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from twin_pair import command
 from twin_plant import ScriptedPlant
 
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
-from dexsim_real.twin.wire.faults import Fault
+from dexsim_real.twin.wire.faults import parse_fault
 from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
@@ -34,12 +33,11 @@ def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
         (Command.EXCHANGE, command(mode=7).tobytes(), 67),
         (Command.EXCHANGE, command(mode=5).tobytes(), 81),
         (Command.READ_REGISTER, b"\x63\x00", 30),
-        (Command.RESET, b"", 30),
     ):
         answer = ask(board, kind, data)
         assert answer.command == Command.ERROR
         assert int.from_bytes(answer.data, "little") == 1501000 + number
-    assert not board.on and not plant.orders
+    assert not board.on and plant.motors is None
     # What is for another hand is no business of this one; a broadcast is.
     assert ask(board, Command.VERSION, target=0x81) is None
     assert ask(board, Command.VERSION, target=0xFF) is not None
@@ -54,18 +52,13 @@ def test_the_state_in_the_wires_few_bits():
     force[0] = 0
     force[0, 0] = [0.149, -0.151, 25.449]
     force[0, 1] = [-13.0, 13.0, 25.6]
-    state = Firmware(ScriptedPlant()).state(PlantMeasurement(0.0, angle, speed, current, np.full(12, 41.6), force))
-    data = state.tobytes()
-    for joint in range(12):
-        row = struct.unpack_from("<BBfhHHHHHhHH", data, 24 * joint)
-        assert row[0] == joint
-        assert abs(row[2] - angle[joint]) <= math.pi / 4096 + 1e-6  # half a step of 12 bits in a turn
-        assert row[2] / (2 * math.pi / 4096) == pytest.approx(round(row[2] / (2 * math.pi / 4096)), abs=1e-3)
-        assert row[3] == np.clip(round(current[joint]), -32768, 32767)
-        assert row[5] == 38 << 8 | 42
-        assert row[9] == np.clip(round(1000 * speed[joint]), -32768, 32767)
-        assert row[4] & 0xF == Mode.PASSIVE
-        assert ((row[4] >> 4) - 2048) * 2 * math.pi / 4096 == pytest.approx(row[2], abs=1e-6)
+    state = Firmware(ScriptedPlant()).state(PlantMeasurement(angle, speed, current, np.full(12, 41.6), force))
+    joint, tick = state["joint"], 2 * math.pi / 4096  # 12 bits in a turn
+    assert joint["position"] == pytest.approx(np.round(angle / tick) * tick, abs=1e-6)
+    assert ((joint["raw_position"] >> 4) - 2048.0) * tick == pytest.approx(joint["position"], abs=1e-6)
+    assert np.all(joint["raw_position"] & 0xF == Mode.PASSIVE) and np.all(joint["temperature"] == 38 << 8 | 42)
+    for name, exact in (("current", current), ("velocity", 1000 * speed)):
+        np.testing.assert_array_equal(joint[name], np.clip(np.round(exact), -32768, 32767))
     taxel, total = state["tip"]["taxel"], state["tip"]["total"]
     assert taxel[0, 0].tolist() == (1, -2, 254) and taxel[0, 1].tolist() == (-128, 127, 255)
     for axis, low, high in (("x", -128, 127), ("y", -128, 127), ("z", 0, 255)):
@@ -79,7 +72,7 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     board = Firmware(plant)
     for kelvin, hot in ((50.0, False), (65.0, True), (54.0, True), (49.0, False)):  # 85, 100, 89 and 84 degrees
         board.faults.clear()
-        board.begin(Fault(kind="heat", part="4", kelvin=kelvin), now=0.0)
+        board.begin(parse_fault(f"0 heat 4 {kelvin} 9"), now=0.0)
         state = frames.decode_state(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
