@@ -6,12 +6,14 @@
 import contextlib
 import dataclasses
 import gc
+import hashlib
 import sys
 import termios
 import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from dexsim import load_hand
@@ -377,12 +379,14 @@ class Session:
 
     def _write_meta(self) -> None:
         arguments, policy = self.arguments, self.controller.policy
+        leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params))
         self.log.add(
             Kind.META,
             {
                 "task": policy.task,
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
+                "policy_sha256": hashlib.sha256(leaves).hexdigest(),
                 "hand": record_of(self.sensing.hand),
                 "calibration": arguments.calibration.read_text() if arguments.calibration else "",
                 "tare": self.sensing.tare,
