@@ -172,10 +172,3 @@ def test_a_convention_that_is_broken_is_named(change, tmp_path, capsys):
     failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
     check, said = WRONG[change]
     assert any(line.startswith(f"FAIL  {check}") and re.search(said, line) for line in failed), failed
-
-
-def test_view_shows_the_grasp(monkeypatch):
-    asked = []
-    monkeypatch.setattr(check_hand, "report", lambda path: ([], True))
-    monkeypatch.setattr("dexsim.view.__main__.main", lambda argv: asked.append(argv) or 0)
-    assert check_hand.main(["leap_like", "--view"]) == 0 and asked == [["grasp", "--hand", "leap_like"]]

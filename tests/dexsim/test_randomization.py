@@ -93,31 +93,7 @@ def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand):
         np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
 
 
-def test_latency_is_in_substeps_and_reaches_its_bound(hand):
-    latency = np.asarray(draws(hand, EVEN).latency)
-    assert latency.min() < 0.05 and 3.95 < latency.max() <= 4.0
-    assert np.all(latency == latency[:, :1])  # common to all joints
-    fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
-    np.testing.assert_allclose(fixed.latency, 3.0, rtol=1e-6)
-
-
 # --- curriculum ------------------------------------------------------------------------------------
-
-
-def test_a_traced_scale_is_the_configured_one(hand):
-    """The scale may come from the training state: 0 is exactly nominal, and none of it recompiles."""
-    draw = jax.jit(lambda key, scale: sample_hand(key, Randomization(), hand, **TIMES, scale=scale))
-    key = jax.random.key(5)
-    for scale in (0.0, 0.5, 1.0):
-        other = sample_hand(key, Randomization(scale=scale), hand, **TIMES)
-        for ours, theirs in zip(jax.tree.leaves(draw(key, scale)), jax.tree.leaves(other), strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
-    nominal = draw(key, 0.0)
-    np.testing.assert_array_equal(nominal.actuator.stall_torque, hand.torque_limit)
-    np.testing.assert_array_equal(nominal.actuator.stiffness, np.full(12, 3.0, np.float32))
-    for zero in (nominal.latency, nominal.encoder_bias, nominal.actuator.coulomb_friction, nominal.actuator.ripple):
-        np.testing.assert_array_equal(zero, 0)
-    assert draw._cache_size() == 1
 
 
 # --- held out ----------------------------------------------------------------------------------------

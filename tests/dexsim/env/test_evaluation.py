@@ -10,7 +10,7 @@ from episodes import reset_to
 
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.evaluation import Evaluation, evaluation_of
+from dexsim.env.evaluation import Evaluation
 from dexsim.env.state import Start
 
 MANY = 400
@@ -96,19 +96,6 @@ class TestPlan:
         plan = plan_of(count, 0)
         assert len(rows_of(plan.start.qpos)) == len(np.unique(plan.row)) == count
         assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
-
-    @pytest.mark.slow
-    def test_a_slice_of_a_plan_gives_its_episodes(self, simple_env):
-        """Of the real task: more episodes than its pool has rows, all from starts of their own."""
-        protocol = evaluation_of(simple_env)
-        plan = protocol.evaluation_plan(12, 0)
-        assert len(rows_of(plan.start.qpos) - rows_of(simple_env.pool.qpos)) == 12
-        starts = jit(protocol.evaluation_starts, once=True)
-        first, second = (starts(jax.tree.map(lambda leaf, i=i: leaf[i : i + 4], plan)) for i in (2, 4))
-        np.testing.assert_array_equal(first.physics.qpos, plan.start.qpos[2:6])
-        np.testing.assert_array_equal(first.episode.object.size, plan.start.object.size[2:6])
-        np.testing.assert_array_equal(first.goal.command, plan.goal.command[2:6])
-        np.testing.assert_array_equal(first.episode.object.mass[2:], second.episode.object.mass[:2])
 
 
 def rows_of(qpos):

@@ -103,16 +103,6 @@ def test_a_bad_mesh_is_an_error(word):
         mesh.load_mesh(bad_meshes()[word])
 
 
-def test_half_a_nanometre_apart_is_one_corner():
-    """On either side of a border of the cells that rounding makes."""
-    box = trimesh.creation.box((0.05, 0.05, 0.05))
-    corners = np.array(box.vertices[box.faces])  # as an STL has them
-    size = 1e-7 * 0.05
-    corners += (corners == 0.025) * (0.5 * size + 0.25e-9 * np.sign(np.arange(12) % 2 - 0.5))[:, None, None]
-    merged = mesh.load_mesh((corners.reshape(-1, 3), np.arange(36).reshape(12, 3)))
-    assert len(merged.vertices) == 8 and len(merged.faces) == 12
-
-
 def test_an_edge_of_four_triangles_is_named():
     box = trimesh.creation.box(2 * BOX)
     touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
@@ -130,11 +120,6 @@ def test_an_open_ball_is_closed_near_its_surface(repair, capsys):
     said = capsys.readouterr().err
     assert "the surface is open" in said and f"its {repair} is" in said
     mesh.check_sign(closed, count=50)  # of thousands of triangles
-
-
-def test_a_closed_mesh_is_not_repaired(capsys):
-    box = trimesh.creation.box(2 * BOX)
-    assert len(mesh.load_mesh(box, repair="shell").faces) == 12 and not capsys.readouterr().err
 
 
 def test_a_mesh_that_cuts_through_itself_cannot_be_signed():

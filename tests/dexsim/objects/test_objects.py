@@ -11,7 +11,6 @@ from shapes import bounds
 
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import (
-    damping_ratio,
     extent,
     sample_object,
     unit_inertia,
@@ -170,18 +169,3 @@ def test_extent_is_the_bound_of_the_turned_shape():
 
 
 # --- the contact's damping -----------------------------------------------------------------------------
-
-
-def bounce(ratio, step=1e-5):
-    """Speed after over speed before contact with x'' = -2 z x' - x, which ends when that no longer pushes."""
-    x, v = 0.0, -1.0
-    while (push := -2 * ratio * v - x) > 0:
-        v += step * push
-        x += step * v
-    return v
-
-
-@pytest.mark.parametrize("restitution", [0.03, 0.9])
-def test_damping_ratio_bounces_as_it_should(restitution):
-    ratio = float(damping_ratio(jnp.float32(restitution)))
-    assert bounce(ratio) == pytest.approx(restitution, rel=0.01)

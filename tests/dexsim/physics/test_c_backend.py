@@ -109,40 +109,9 @@ class TestClosedForms:
         np.testing.assert_allclose(held.warmstart[12:15], 0.0, atol=1e-4)  # no acceleration by gravity or push
         np.testing.assert_array_equal(held.qpos[:12], free.qpos[:12])
 
-    def test_sliding_on_the_palm(self, hand, grips):
-        """A box that F pushes over the palm's plane gains (F - mu N) / m, and N is what its weight and lift ask for."""
-        physics, friction, share = make(hand, gravity=(-9.81, 0.0, 0.0)), 0.4, 0.7
-        start = next(g for g in grips if g[0].object.active[0] and not g[0].object.active[1])
-        half = np.asarray(start[0].object.size[0, 0])
-        target, state = map(row0, at([start], [half + palm_height(physics), 0.0, -0.5]))
-        target = dataclasses.replace(
-            target,
-            com=jnp.zeros(3),
-            link_friction=jnp.float32(friction),
-            inertia=jnp.full(3, 0.1),  # so that it does not rock
-        )
-        advance = jax.jit(lambda state, push: physics.advance(hold, target, state, push)[0])
-        for _ in range(40):
-            state = advance(state, jnp.zeros(3))
-        assert np.abs(state.qvel[12:]).max() < 2e-3, "not at rest"
-        speeds, push = [], float(target.mass) * 9.81 * share
-        for _ in range(6):
-            state = advance(state, jnp.array([0.0, push, 0.0]))
-            speeds.append(np.array(state.qvel[12:14]))
-        (lifted, gained), weight = speeds[-1] - speeds[1], 9.81 * 4 * 0.03
-        assert gained > 0.3
-        assert gained == pytest.approx(share * weight - friction * (weight + lifted), rel=2e-3)
-
 
 def row0(tree):
     return jax.tree.map(lambda leaf: leaf[0], tree)
-
-
-def palm_height(physics):
-    model = physics.mj_model
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return data.geom("palm_face").xpos[0]
 
 
 class TestForces:
@@ -301,11 +270,6 @@ try:
 except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
     print("stopped", type(error).__name__, flush=True)
 """
-CACHED = """
-hits.clear()
-after, _ = ticks(state)
-print(json.dumps([len(hits), np.asarray(after.qpos).tobytes().hex()]))
-"""
 
 
 def start(program, count, before="", **environment):
@@ -337,20 +301,6 @@ def test_ctrl_c_while_the_pool_runs():
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=300)
     assert out.startswith("stopped") and process.returncode == 0
-
-
-@pytest.mark.slow
-def test_programs_are_cached(tmp_path):
-    """A second process takes the program from JAX's cache, and it finds this process's engine."""
-    options = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    runs = []
-    for _ in range(2):
-        process = start(CACHED, 4, **options)
-        out, _ = process.communicate(timeout=300)
-        assert process.returncode == 0
-        runs.append(json.loads(out))
-    assert runs[0][0] == 0 and runs[1][0] > 0
-    assert runs[0][1] == runs[1][1]
 
 
 # --- fingertips as thick as their episode has them, and fingers that do not pass through each other ---
