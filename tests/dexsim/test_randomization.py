@@ -93,21 +93,22 @@ def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand):
         np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
 
 
-# --- curriculum ------------------------------------------------------------------------------------
+# --- held out, and in corners ------------------------------------------------------------------------
 
 
-# --- held out ----------------------------------------------------------------------------------------
+def ranges_of(hand, config):
+    """(name, draws, low, high, nominal) of all ranges but that of `ripple_count`, which has no nominal value."""
+    for name, values in quantities(hand, draws(hand, config)).items():
+        if name != "ripple_count":
+            span = getattr(config, name)
+            low, high = span if isinstance(span, tuple) else (-span, span)
+            nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+            yield name, np.asarray(values, float), low, high, nominal
 
 
 def test_held_out_hands_lie_outside_every_range(hand):
-    config = dataclasses.replace(EVEN, extremes=1.0, beyond=0.4)
-    found = quantities(hand, draws(hand, config))
-    for name in found.keys() - {"ripple_count"}:
-        values = np.asarray(found[name], float)
-        span = getattr(config, name)
-        low, high = span if isinstance(span, tuple) else (-span, span)
-        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
-        slack = 1e-6
+    slack = 1e-6
+    for name, values, low, high, nominal in ranges_of(hand, dataclasses.replace(EVEN, extremes=1.0, beyond=0.4)):
         assert np.all((values <= low + slack) | (values >= high - slack)), name
         far = 1.4 * max(high - nominal, nominal - low) + slack
         assert np.all(np.abs(values - nominal) <= far), name
@@ -117,33 +118,18 @@ def test_held_out_hands_lie_outside_every_range(hand):
         assert np.all(np.abs(values - nominal) > 1e-4), name
 
 
-# --- extremes -----------------------------------------------------------------------------------------
-
-
 def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
-    config = dataclasses.replace(EVEN, extremes=0.3)
-    drawn = draws(hand, config)
-    plain = draws(hand, EVEN)
-    at_end = {}
-    for name, values in quantities(hand, drawn).items():
-        if name == "ripple_count":
-            continue
-        span = getattr(config, name)
-        low, high = span if isinstance(span, tuple) else (-span, span)
-        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+    plain, corners = {name: values for name, values, *_ in ranges_of(hand, EVEN)}, None
+    for name, values, low, high, nominal in ranges_of(hand, dataclasses.replace(EVEN, extremes=0.3)):
         ends = [end for end in (low, high) if end != nominal]
-        values = np.asarray(values, float)
         near = np.min([np.abs(values - end) for end in ends], 0) < 1e-6 * max(1.0, abs(high))
-        at_end[name] = near.all(1)
-        assert near[at_end[name]].all()
-        sides = [np.mean(np.abs(values[at_end[name]] - end) < 1e-5) for end in ends]
+        corners = near.all(1) if corners is None else corners
+        np.testing.assert_array_equal(near.all(1), corners, err_msg=name)
+        sides = [np.mean(np.abs(values[corners] - end) < 1e-5) for end in ends]
         assert min(sides) > (0.4 if len(ends) == 2 else 0.99), name
         # Elsewhere the draw is what it is without extremes.
-        others = ~at_end["stiffness_factor"]
-        np.testing.assert_array_equal(values[others], np.asarray(quantities(hand, plain)[name], float)[others])
-    assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
-    for name, rows in at_end.items():
-        np.testing.assert_array_equal(rows, at_end["stiffness_factor"], err_msg=name)
+        np.testing.assert_array_equal(values[~corners], plain[name][~corners])
+    assert 0.25 < np.mean(corners) < 0.35
 
 
 # --- refusals ------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny_train
 from test_train import QUICK, exit_code
-from tiny_env import CONFIG, SMALL, TinyEnv
+from tiny_env import CONFIG, SMALL, TinyEnv, training_of
 
 from dexsim_ppo import train
 from dexsim_ppo.learner.ppo import make_train
@@ -19,7 +19,7 @@ from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 
 def trained(calls):
-    training = make_train(TinyEnv(), CONFIG)
+    training = training_of(CONFIG)
     state = training.init(jax.random.key(0))
     for _ in range(calls):
         state, _ = training.step(state)

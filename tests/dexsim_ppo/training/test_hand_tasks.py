@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dexsim
+from dexsim.objects.config import ObjectConfig
 from dexsim.randomization import Randomization
 from dexsim.task_spec import TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
@@ -44,7 +45,8 @@ def train(task, config, iterations):
 
 def test_grasp():
     """It catches most objects after 26,000 steps; an idle hand drops them all."""
-    config = GraspConfig(pool_size=80, episode_seconds=2.0, randomization=NOMINAL)
+    ball = ObjectConfig(shapes=("sphere",))
+    config = GraspConfig(pool_size=16, episode_seconds=2.0, randomization=NOMINAL, objects=ball)
     idle, trained = train("grasp", config, 25)
     assert np.nanmean(trained[-5:]) > np.nanmean(idle) + 10.0, (idle, trained)
 
