@@ -17,7 +17,6 @@ from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
-from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
 from dexsim_ppo.policy import load_policy
 
@@ -81,25 +80,19 @@ def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
 WORLDS = 8
 
 
-@functools.cache
-def player(env):
-    """`play(states, seconds, policy)`: whether episodes failed [T, B], fingertip forces [T, B, F] N, and metrics.
+def play(env, step, states, seconds, policy=None):
+    """Whether episodes failed [T, B], fingertip forces [T, B, F] N, and metrics; a failure does not stop a world here.
 
-    Without a policy the hand gets no action. A failure does not stop a world here.
+    Without a policy the hand gets no action.
     """
-    step = jit(jax.vmap(env.step), once=True)
-
-    def play(states, seconds, policy=None):
-        history, action = [], jnp.zeros((WORLDS, 12))
-        carry, observe = policy and policy.initial_carry(WORLDS), policy and observer(env.hand, policy)
-        for _ in range(round(seconds / env.control_period)):
-            if policy is not None:
-                carry, action = policy.act(carry, observe(states.readings))
-            states = step(states, action)
-            history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
-        return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
-
-    return play
+    history, action = [], jnp.zeros((WORLDS, 12))
+    carry, observe = policy and policy.initial_carry(WORLDS), policy and observer(env.hand, policy)
+    for _ in range(round(seconds / env.control_period)):
+        if policy is not None:
+            carry, action = policy.act(carry, observe(states.readings))
+        states = step(states, action)
+        history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
+    return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
 
 
 def observer(hand, policy):
@@ -109,33 +102,31 @@ def observer(hand, policy):
     return jax.jit(jax.vmap(lambda readings: observation.observe(hand, readings, fields, config)))
 
 
-def test_the_grasp_holds_and_presses_as_asked():
+def test_the_grasp_holds_and_presses_as_asked(grasp_rollout):
     """Four seconds from four starts, each once with the lowest and once with the highest command.
 
     A hand that does nothing drops every object, so that holding says something.
     """
-    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
-    goals = GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
-    pairs = jnp.repeat(jnp.arange(WORLDS // 2), 2)
-    rows = jnp.array([1, 6, 11, 16])[pairs]  # of different shapes
-    starts = jit(jax.vmap(reset_to(env)), once=True)(
-        jax.random.split(jax.random.key(0), WORLDS // 2)[pairs], rows, goals
-    )
-    assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
-    play = player(env)
-    dropped, force, _ = play(starts, 4.0, load_policy("grasp"))
+    env, goals = grasp_rollout.env, GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
+    pairs = np.repeat(np.arange(WORLDS // 2), 2)
+    rows = np.unique(env.pool.object.shape_index, return_index=True)[1][pairs]  # of different shapes
+    keys = jax.random.split(jax.random.key(0), WORLDS // 2)[pairs]
+    starts = jit(jax.vmap(reset_to(env)), once=True)(keys, rows, goals)
+    dropped, force, _ = play(env, grasp_rollout.step, starts, 4.0, load_policy("grasp"))
     assert np.sum(~dropped.any(0)) >= 6
     late = force[len(force) // 2 :, :, 1:].sum(-1).mean(0)  # N, of the four fingers
     assert np.all(late[1::2] - late[::2] > 4.0), late
-    dropped, _, _ = play(starts, 4.0)
+    dropped, _, _ = play(env, grasp_rollout.step, starts, 4.0)
     assert np.all(dropped.any(0))
 
 
 @functools.cache
-def rotation_env(name):
+def rotation(name):
+    """The environment of a policy, and its compiled step."""
     policy = load_policy(name)
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
-    return dexsim.make(policy.task, dataclasses.replace(config, pool_size=WORLDS), backend="c")
+    env = dexsim.make(policy.task, dataclasses.replace(config, pool_size=WORLDS), backend="c")
+    return env, jit(jax.vmap(env.step), once=True)
 
 
 @pytest.mark.parametrize(
@@ -146,14 +137,13 @@ def test_the_rotation_policies_turn(name, of):
 
     The policy without orientation was trained in the environment `of` the one with it.
     """
-    env = rotation_env(of)
+    env, step = rotation(of)
     starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
-    play = player(env)
-    dropped, _, metrics = play(starts, 4.0, load_policy(name))
+    dropped, _, metrics = play(env, step, starts, 4.0, load_policy(name))
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
     if name == "rotate":
-        _, _, metrics = play(starts, 4.0)
+        _, _, metrics = play(env, step, starts, 4.0)
         assert not metrics["successes"].any()
 
 

@@ -18,18 +18,12 @@ from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 
-def trained(calls):
-    training = training_of(CONFIG)
-    state = training.init(jax.random.key(0))
-    for _ in range(calls):
-        state, _ = training.step(state)
-    return Policy.from_training(TinyEnv(), CONFIG, state)
-
-
 @pytest.fixture(scope="module")
 def policy():
     """The integrator, hardly trained."""
-    return trained(1)
+    training = training_of(CONFIG)
+    state, _ = training.step(training.init(jax.random.key(0)))
+    return Policy.from_training(TinyEnv(), CONFIG, state)
 
 
 @pytest.fixture
@@ -37,10 +31,9 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
-def started(policy, config, env=None):
-    env = env or TinyEnv()
-    training = make_train(env, config)
-    return env, training, initialize_from(policy, config, training.init(jax.random.key(1)))
+def started(policy, config):
+    training = make_train(TinyEnv(), config)
+    return training, initialize_from(policy, config, training.init(jax.random.key(1)))
 
 
 def test_it_sees_as_the_policy_saw(policy):
@@ -48,7 +41,7 @@ def test_it_sees_as_the_policy_saw(policy):
     seeing = Normalizer(jnp.array([0.5, -0.5, 0.0]), jnp.array([1e-3, 0.4, 2.0]), 1.5)
     policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, normalizer=seeing))
     config = fine_tuning_config(policy, SMALL)
-    again = Policy.from_training(TinyEnv(), config, started(policy, config)[2]).params.normalizer
+    again = Policy.from_training(TinyEnv(), config, started(policy, config)[1]).params.normalizer
     assert again.clip == 1.5
     np.testing.assert_allclose(again.mean, seeing.mean)
     np.testing.assert_allclose(again.std, seeing.std, rtol=1e-5)
@@ -56,7 +49,7 @@ def test_it_sees_as_the_policy_saw(policy):
 
 def test_the_critic_learns_first_and_then_both(policy):
     config = dataclasses.replace(fine_tuning_config(policy, SMALL), critic_first=3)
-    _, training, state = started(policy, config)
+    training, state = started(policy, config)
     params = []
     for _ in range(4):
         state, metrics = training.step(jax.tree.map(jnp.copy, state))
