@@ -89,18 +89,6 @@ class TestResuming:
         report = json.loads((here / "stub" / "b" / "report.json").read_text())
         assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
-    def test_another_setting_is_another_row(self, paper, here):
-        experiment, calls = stub(paper, training_seeds=0)
-        budget = paper.data.BUDGETS["cpu"]
-        paper.command.run(experiment, budget, here, here / "work")
-        changed = dataclasses.replace(experiment.rows[1], settings=("reward.force=1",))
-        other = dataclasses.replace(experiment, rows=(experiment.rows[0], changed, experiment.rows[2]))
-        assert set(paper.command.reports_of(other, here)) == {"a", "c"}
-        paper.command.run(other, budget, here, here / "work")
-        assert calls[3:] == [("b", 0)]
-        relabelled = dataclasses.replace(changed, label="another label", paper={"x": "1"})
-        assert paper.data.settings_of(relabelled) == paper.data.settings_of(changed)
-
 
 # --- what the rows are ----------------------------------------------------------------------------------
 

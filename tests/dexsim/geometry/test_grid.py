@@ -53,21 +53,6 @@ def test_distance_to_a_box_mesh_is_the_closed_form():
     np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
 
 
-def test_nearest_triangle_is_the_nearest_of_all():
-    """Against all triangles by dense sampling, on a shape with a hole and concave parts."""
-    ring = mesh.load_mesh(trimesh.creation.torus(0.03, 0.01, 32, 16))
-    points = np.random.default_rng(1).uniform(-0.06, 0.06, (200, 3))
-    value, _ = mesh.signed_distance(ring, points)
-    weight = np.array([[i, j, 12 - i - j] for i in range(13) for j in range(13 - i)]) / 12
-    samples = np.einsum("wc,tcd->twd", weight, ring.corners).reshape(-1, 3)
-    found = np.array([np.linalg.norm(samples - p, axis=1).min() for p in points])
-    assert np.all(found >= np.abs(value) - 1e-9) and np.all(found - np.abs(value) < 2.5e-4)
-    # The sign is that of the ring itself, but for the sliver between facets and curve.
-    across = np.hypot(np.linalg.norm(points[:, :2], axis=1) - 0.03, points[:, 2]) - 0.01
-    clear = np.abs(across) > 6e-4
-    assert np.all((value < 0)[clear] == (across < 0)[clear]) and (value < 0).sum() > 5
-
-
 def turned(part):
     part.invert()
     return part

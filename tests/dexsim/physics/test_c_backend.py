@@ -21,7 +21,6 @@ from dexsim.physics import c_backend
 from dexsim.physics import model as scene_model
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
-from dexsim.physics.model import build_scene
 from dexsim.physics.physics import Physics
 
 WORLDS = 8
@@ -294,32 +293,3 @@ def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
     assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)
     np.testing.assert_allclose(around[tips], size[tips, 0], atol=1e-8)
-
-
-def test_index_and_middle_finger_stop_each_other(hand):
-    """The index finger swings into the middle one at full torque, and then rests on it."""
-    model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c").model
-    model.opt.timestep = 0.005  # s; the motors below are explicit
-    data = mujoco.MjData(model)
-    names = list(hand.joint_names)
-    bend, angle = names.index("index_bend"), np.where(np.arange(12) < 3, 0.0, 0.3)
-    angle[bend] = hand.joint_lower[bend]
-    data.qpos[:12], data.qpos[12:15] = angle, (0.0, 0.0, 2.0)
-    data.qpos[bend] = 0.0
-    data.qpos[15] = 1.0
-    depth = []
-    for _ in range(300):
-        torque = 3.0 * (angle - data.qpos[:12]) - 0.1 * data.qvel[:12]
-        torque[bend] = -hand.torque_limit[bend]
-        data.qfrc_applied[:12] = torque
-        mujoco.mj_step(model, data)
-        depth.append(
-            min(
-                mujoco.mj_geomDistance(model, data, model.geom(a).id, model.geom(b).id, 0.05, np.zeros(6))
-                for a in ("index_link1", "index_core")
-                for b in ("mid_link1", "mid_core")
-            )
-        )
-    assert data.qpos[bend] > hand.joint_lower[bend] + 0.02, "it passes through"
-    assert -2e-3 < min(depth) < 0.0
-    assert min(depth[10:]) > -1e-3
