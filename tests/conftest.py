@@ -64,10 +64,10 @@ hypothesis.settings.load_profile("dexsim")
 
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
 LONGEST = """
-test_hand_tasks test_press_fit test_shipped_policy test_identification test_docs test_calibrate_command test_bridge_run
-test_procedure test_calibration test_identify_drives test_rotate test_motors_off test_view test_shipped_policies
-test_env test_engines test_randomization test_env_options test_drives test_learning test_train test_check_hand test_sharding
-test_twin_virtual
+test_hand_tasks test_press_fit test_shipped_policy test_identification test_docs test_calibrate_command
+test_bridge_run test_procedure test_calibration test_identify_drives test_rotate test_motors_off test_view
+test_shipped_policies test_env test_engines test_randomization test_env_options test_drives test_learning
+test_train test_check_hand test_sharding test_twin_virtual
 """.split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
