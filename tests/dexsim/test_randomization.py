@@ -6,10 +6,9 @@ import functools
 import jax
 import numpy as np
 import pytest
-from ranges import draw_alone, range_paths
+from swapped import drawn, rollout
 
 from dexsim.core.errors import ConfigError
-from dexsim.objects.config import SIZE_RANGES
 from dexsim.randomization import Randomization, sample_hand
 
 TIMES = dict(timestep=0.005, control_period=0.03)
@@ -150,56 +149,33 @@ def test_refusals(values, word):
         Randomization(**values)
 
 
-# --- what each range reaches --------------------------------------------------------------------------
+# --- what each value that is drawn reaches ------------------------------------------------------------
 
-# By the names of the drive's parameters and of the compiled model's fields.
-RANGES = {
-    "randomization.stiffness_factor": "hand.actuator.stiffness",
-    "randomization.damping_factor": "hand.actuator.damping",
-    "randomization.dead_band": "hand.actuator.dead_band",
-    "randomization.torque_factor": "hand.actuator.stall_torque",
-    "randomization.speed_factor": "hand.actuator.no_load_speed",
-    "randomization.efficiency": "hand.actuator.efficiency",
-    "randomization.latency": "hand.latency",
-    "randomization.latency_spread": "hand.latency",
-    "randomization.ripple": "hand.actuator.ripple",
-    "randomization.ripple_count": "hand.actuator.ripple_count",
-    "randomization.coulomb_friction": "hand.actuator.coulomb_friction",
-    "randomization.viscous_friction": "hand.actuator.viscous_friction",
-    "randomization.sensing_latency": "hand.sensing_latency",
-    "randomization.encoder_bias": "hand.actuator.encoder_bias",
-    "randomization.torque_gain": "hand.torque_gain",
-    "randomization.taxel_gain": "hand.taxel_gain",
-    "randomization.gravity_tilt": "hand.tilt",
-    "randomization.pad_thickness_delta": "hand.pad_thickness_delta",
-    "sensing.orientation.bias": "imu.bias",
-    "sensing.orientation.drift": "imu.drift",
-    "sensing.orientation.delay": "imu.delay",
-    **{f"objects.{name}": "geom_size" for name in SIZE_RANGES},
-    "objects.mass": "body_mass",
-    "objects.inertia_scale": "body_inertia",
-    "objects.com_offset": "body_ipos",
-    "objects.friction": "pair_friction",
-    "objects.link_friction": "pair_friction",
-    "objects.stiffness": "pair_solref",
-    "objects.restitution": "pair_solref",
-}
-# In the readings, without effect on the motion.
+MOVING = """
+hand.actuator.stiffness hand.actuator.damping hand.actuator.dead_band hand.actuator.stall_torque
+hand.actuator.no_load_speed hand.actuator.efficiency hand.actuator.ripple hand.actuator.ripple_count
+hand.actuator.ripple_phase hand.actuator.encoder_bias hand.actuator.coulomb_friction hand.actuator.viscous_friction
+hand.latency hand.tilt hand.pad_thickness_delta object.mass object.inertia object.com object.friction
+object.link_friction object.contact object.size
+""".split()
+# In a reading, without effect on the motion.
 SENSED = {
-    "randomization.sensing_latency": "joint_position",
-    "randomization.torque_gain": "joint_torque",
-    "randomization.taxel_gain": "taxel_force",
-    "sensing.orientation.bias": "palm_gravity",
-    "sensing.orientation.drift": "object_quat",
-    "sensing.orientation.delay": "object_quat",
+    "hand.sensing_latency": "joint_position",
+    "hand.torque_gain": "joint_torque",
+    "hand.taxel_gain": "taxel_force",
+    "imu.bias": "palm_gravity",
+    "imu.drift": "object_quat",
+    "imu.delay": "object_quat",
 }
 
 
-def test_every_range_reaches_the_model_and_then_motion_or_readings(grasp_env, grasp_rollout):
+def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
     states = grasp_rollout.reset(jax.random.key(21))
-    assert set(range_paths(grasp_env)) == set(RANGES)
-    for path, leaf in RANGES.items():
-        changed, moved = draw_alone(grasp_env, grasp_rollout.step, states, path, ticks=9)
-        assert leaf in changed, path
-        assert moved[SENSED.get(path, "motion")] > 1e-6, path
-        assert (moved["motion"] == 0) == (path in SENSED), path
+    found, shows = drawn(states.episode), rollout(grasp_rollout.step, states, ticks=9)
+    shape = {"object.shape_index", "object.position", "object.active"}  # that belong to a size
+    assert set(found) - shape == {*MOVING, *SENSED}
+    assert np.ptp(found["object.contact"], axis=0).min() > 0, "stiffness or damping of the contact is not drawn"
+    for path in MOVING:
+        assert "motion" in shows(path), path
+    for path, reading in SENSED.items():
+        assert reading in (moved := shows(path)) and "motion" not in moved, path

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ranges import draw_alone
 from simple_physics import SimplePhysics
+from swapped import drawn, rollout
 
 import dexsim
 from dexsim.core.compilation import jit
@@ -17,7 +17,6 @@ from dexsim.sensing.config import Sensing
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 
-WORLDS = 4
 KEY = jax.random.key(0)
 POOR_TAXELS = TaxelSensor(
     hysteresis=(0.0, 0.3),
@@ -45,7 +44,7 @@ class TestScale:
     def test_zero_is_nominal(self, env, hand):
         objects = env.config.objects
         rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.arange(64) % 4], env.pool.object)
-        draw = jax.vmap(lambda *given: env.sampler.sample(*given, jnp.float32(0)))
+        draw = jit(jax.vmap(lambda *given: env.sampler.sample(*given, jnp.float32(0))), once=True)
         state = SimpleNamespace(episode=draw(*jax.random.split(jax.random.key(0), (3, 64)), rows))
         for value, nominal in (
             (state.episode.hand.actuator.stall_torque, hand.torque_limit),
@@ -82,10 +81,10 @@ class TestScale:
         np.testing.assert_array_equal(begun.episode.object.mass[:4], np.float32(np.mean(env.config.objects.mass)))
 
 
-def test_every_range_of_taxels_reaches_their_readings_and_nothing_else(env):
-    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(KEY)
-    step = jit(jax.vmap(env.step), once=True)
-    for name in ("hysteresis", "hysteresis_time", "crosstalk", "gain", "bias", "drift", "dead", "rate"):
-        changed, moved = draw_alone(env, step, states, f"sensing.taxel.{name}", ticks=10)
-        assert changed == [f"taxels.{ {'hysteresis_time': 'memory', 'dead': 'alive'}.get(name, name) }"], name
-        assert [reading for reading, size in moved.items() if size > 0] == ["taxel_force"], name
+def test_every_error_of_taxels_reaches_their_readings_and_nothing_else(env):
+    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(KEY)
+    shows = rollout(jit(jax.vmap(env.step), once=True), states, ticks=10)
+    found = {path.removeprefix("taxels.") for path in drawn(states.episode) if path.startswith("taxels.")}
+    assert found == set("hysteresis memory crosstalk gain bias drift alive rate phase".split())
+    for name in found:
+        assert shows(f"taxels.{name}") == ["taxel_force"], name

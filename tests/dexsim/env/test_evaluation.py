@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import reset_to
 
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
@@ -19,10 +18,13 @@ MANY = 400
 @pytest.fixture(scope="module")
 def drawn(simple_env):
     """The objects of `MANY` episodes from each row of the pool: leaves [8, MANY, ...]."""
-    reset = jit(
-        jax.vmap(jax.vmap(lambda key, row: reset_to(simple_env)(key, row).episode.object, (0, None))), once=True
-    )
-    return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
+
+    def draw(key, row):
+        object = jax.tree.map(lambda rows: jnp.asarray(rows)[row], simple_env.pool.object)
+        return simple_env.sampler.sample(*jax.random.split(key, 3), object).object
+
+    keys = jax.random.split(jax.random.key(5), (8, MANY))
+    return jit(jax.vmap(jax.vmap(draw, (0, None))), once=True)(keys, jnp.arange(8))
 
 
 def properties(object):

@@ -54,7 +54,7 @@ class Balance(dexsim.Task):
 
     def make_pool(self, key):
         keys = jax.random.split(key, self.config.pool_size)
-        object = jax.vmap(lambda key: self.sample_object(key, self.config, jnp.int32(0)))(keys)
+        object = jax.jit(jax.vmap(lambda key: self.sample_object(key, self.config, jnp.int32(0))))(keys)
         rest = jnp.concatenate([jnp.zeros(self.hand.num_joints), jnp.array([*self.reference, 1.0, 0.0, 0.0, 0.0])])
         qpos = jnp.tile(rest, (len(keys), 1))
         return Start(qpos=qpos, qvel=jnp.zeros((len(keys), self.hand.num_joints + 6)), object=object)

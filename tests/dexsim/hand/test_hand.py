@@ -78,10 +78,8 @@ def test_finger_and_joint_tables(hand):
     assert (hand.num_joints, hand.num_fingers, hand.num_taxels) == (12, 5, 120)
 
 
-@pytest.mark.parametrize("name", ["xhand_right", "leap_like"])
-def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(name):
+def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(hand):
     """In C MuJoCo, which turns a force at the pad into joint torques."""
-    hand = load_hand(name)
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     data, joints = mujoco.MjData(model), [model.joint(joint) for joint in hand.joint_names]
     data.qpos[[joint.qposadr[0] for joint in joints]] = hand.grasp_posture

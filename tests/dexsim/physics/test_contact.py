@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from episodes import tip_stiffness
 
-from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
+from dexsim.objects.config import SHAPES
 from dexsim.objects.params import damping_ratio
 from dexsim.physics import contact
-from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.physics import Physics
-from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.grasp.task import Grasp
 from dexsim.touch.skin import Skin
 
 BALL = """
@@ -64,11 +60,10 @@ def test_a_ball_bounces_as_configured(restitution, mass):
     assert data.qvel[2] / 0.5 == pytest.approx(restitution, rel=0.1)
 
 
-def test_springs_follow_the_skin(hand):
+def test_springs_follow_the_skin(hand, grasp_env):
     """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
     law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
-    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="c")
-    pool = Grasp(GraspConfig(pool_size=3 * len(SHAPES)), hand).make_pool(jax.random.key(3))
+    physics, pool = grasp_env.physics, grasp_env.pool
 
     @jax.jit
     def configure(target, qpos):
@@ -80,7 +75,7 @@ def test_springs_follow_the_skin(hand):
         for side in (physics.mj_model.pair_geom1, physics.mj_model.pair_geom2)
     )
     changed = dict.fromkeys(SHAPES, 0)
-    for index in range(3 * len(SHAPES)):
+    for index in np.concatenate([c_scene.rows_of(pool, shape)[:3] for shape in SHAPES]):
         start = c_scene.row(pool, index)
         model, qpos, qvel, *_ = c_scene.squeeze(hand, start, rng)
         nominal = model.pair_solref.copy()

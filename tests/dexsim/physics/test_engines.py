@@ -83,8 +83,10 @@ def outcome_on(hand, backend):
     physics = Physics(hand, ("capsule",), SIZE, PhysicsConfig(substeps=2), gravity=(9.81, 0, 0), backend=backend)
 
     def outcome(x):
+        target = x[:2]
+
         def law(substep, position, velocity):
-            return 2.0 * (x[:2] - position) - 0.05 * velocity
+            return 2.0 * (target - position) - 0.05 * velocity
 
         held = dataclasses.replace(OBJECT, friction=x[2], mass=x[3])
         result = physics.advance(law, held, PhysicsState(POSE, SPEED, jnp.zeros(9)), jnp.zeros(3))
@@ -95,13 +97,13 @@ def outcome_on(hand, backend):
 
 @pytest.fixture(scope="module")
 def linearized(hand):
-    """Outcome, gradient of `WEIGHT` times it, and its slope along [1, 1, 1, 1] in forward mode: one compilation."""
+    """Outcome and gradient of `WEIGHT` times it: one compilation."""
     outcome = outcome_on(hand, "mjx")
 
     @functools.partial(jit, once=True)
     def run(x):
-        value, push = jax.linearize(outcome, x)
-        return value, jax.linear_transpose(push, x)(WEIGHT)[0], WEIGHT @ push(jnp.ones(4))
+        value, pull = jax.vjp(outcome, x)
+        return value, pull(WEIGHT)[0]
 
     return run
 
@@ -121,13 +123,12 @@ def test_a_grip_and_a_slip_are_c_mujocos(hand, linearized, moment):
 
 def test_gradients_in_a_pinch_are_finite_differences(linearized, moment):
     steps = np.diag(np.float32([0.01, 0.01, 0.02, 0.002]))
-    _, reverse, forward = linearized(moment)
+    _, reverse = linearized(moment)
     numeric = [
         WEIGHT @ (linearized(moment + step)[0] - linearized(moment - step)[0]) / (2 * step.sum()) for step in steps
     ]
     np.testing.assert_allclose(reverse, numeric, rtol=0.01, atol=1e-3)
-    assert float(forward) == pytest.approx(float(reverse.sum()), rel=1e-4)
-    assert (reverse[2] != 0) == (moment[2] < 0.5), "contacts that stick do not feel friction, those that slip do"
+    assert (abs(reverse[2]) > 1e-6) == (moment[2] < 0.5), "contacts that stick do not feel friction, those that slip do"
 
 
 def test_what_mjx_refuses_is_named(hand, monkeypatch):
