@@ -165,18 +165,6 @@ def test_the_whole_command(tmp_path, capsys):
     np.testing.assert_allclose(nominal.actuator.damping, 0.1 / 1.1, rtol=1e-3)
 
 
-def test_an_imported_hand_can_be_mirrored(tmp_path, monkeypatch):
-    monkeypatch.delitem(check_hand.CHECKS, "random actions stay finite")  # it takes seconds
-    path = urdf(tmp_path)
-    for options in ([], ["--mirror"]):
-        out = str(tmp_path / "".join(["out", *options]))
-        assert import_hand.main([str(path), "--name", "left_one", "--out", out, "--yes", *options]) == 0
-    plain, mirrored = (load_hand(tmp_path / out / "left_one.toml") for out in ("out", "out--mirror"))
-    assert (plain.side, mirrored.side) == ("right", "left") and plain.grasp_posture == mirrored.grasp_posture
-    tips = [forward_kinematics(hand, np.float32(hand.grasp_posture)).tip_position for hand in (plain, mirrored)]
-    np.testing.assert_allclose(tips[1], np.asarray(tips[0]) * [1, -1, 1], atol=1e-6)
-
-
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size="0.015 0.05 0.05"/>
 {}</body></worldbody>{}</mujoco>"""
 CHAIN = """<body name="{0}" pos="0 {1} 0.05"><joint name="{0}_a" axis="0 1 0" range="0 1.5"/>

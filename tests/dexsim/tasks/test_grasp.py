@@ -240,17 +240,6 @@ class TestPool:
         assert low - 1e-5 <= gap.min() and gap.max() <= high + 1e-5
         assert np.ptp(gap) > 0.7 * (high - low)
 
-    def test_ranges(self, hand, grasp_env):
-        pool, config = grasp_env.pool, grasp_env.config
-        joints = pool.qpos[:, :12]
-        assert np.all(joints >= hand.joint_lower) and np.all(joints <= hand.joint_upper)
-        curl, noise = joints - np.array(config.posture), 0.12 + 1e-6
-        assert np.all(np.abs(curl[:, :4]) <= noise)  # thumb and splay: noise alone
-        assert np.all(curl[:, 4:] >= config.curl[0] - noise)
-        assert np.all(curl[:, 4:] <= config.curl[1] + noise)
-        np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1.0, atol=1e-5)
-        assert not np.any(pool.qvel)
-
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))
         with pytest.raises(ConfigError, match="0 of 5 start states of shape 'box'"):
