@@ -48,7 +48,7 @@ def test_log_std_stays_between_floor_and_cap():
     config = dataclasses.replace(SMALL, learning_rate=1.0, learning_rate_max=1.0, kl_target=0.0)
     state = training_of().init(jax.random.key(0))
     for sign, bound in ((1.0, config.std_min), (-1.0, config.std_max)):
-        learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
+        learner = Learner(state.params, state.adam, jnp.float32(config.learning_rate), state.skipped_updates)
         grads = jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), state.params)
         for _ in range(5):
             learner, _ = update.apply_gradients(config, learner, grads)
