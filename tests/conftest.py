@@ -24,20 +24,27 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_cache / "xla")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 os.environ.setdefault("MPLBACKEND", "agg")
-if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
-    # Each about halves the compilation of a physics step, which is most of what the suite does. XLA ends the
-    # process over a flag that it does not know, and versions know different ones: a process that may end tries.
-    from dexsim.core.compilation import LIGHT
+# Compilation is most of what the suite does, and takes a third of the time without optimisation and by the older
+# emitters. The other core has the suite's other process: to split a program for several threads only costs.
+XLA_FLAGS = (
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
+)
 
-    # The other core has the suite's other process: to split a program into parts for several threads only costs.
-    for option, value in (*LIGHT, ("xla_cpu_parallel_codegen_split_count", 1)):
-        wanted = f"{os.environ.get('XLA_FLAGS', '')} --{option}={str(value).lower()}".strip()
-        if not subprocess.run(
-            [sys.executable, "-c", "import jax; jax.devices()"],
-            capture_output=True,
-            env={**os.environ, "XLA_FLAGS": wanted},
-        ).returncode:
-            os.environ["XLA_FLAGS"] = wanted
+
+def with_flags(*flags: str) -> dict[str, str]:
+    return {**os.environ, "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()}
+
+
+def is_known(*flags: str) -> bool:
+    """Whether XLA takes these flags. It ends the process over one that its version does not know."""
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    return not subprocess.run(command, capture_output=True, env=with_flags(*flags)).returncode
+
+
+if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ |= with_flags(*(XLA_FLAGS if is_known(*XLA_FLAGS) else filter(is_known, XLA_FLAGS)))
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
@@ -45,7 +52,7 @@ import pytest  # noqa: E402
 
 from dexsim.core import compilation  # noqa: E402
 
-# What the library compiles runs for seconds at most here, and compiles in half the time where it is not optimised.
+# Also what the library compiles with options of its own.
 compilation.jit = functools.partial(compilation.jit, once=True)
 
 # A shell that starts the suite in the background has it ignore SIGINT, which programs started by tests would inherit.
@@ -56,34 +63,12 @@ hypothesis.settings.register_profile("dexsim", deadline=None, max_examples=20, d
 hypothesis.settings.load_profile("dexsim")
 
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
-LONGEST = (
-    "test_hand_tasks",
-    "test_press_fit",
-    "test_shipped_policy",
-    "test_identification",
-    "test_engines",
-    "test_randomization",
-    "test_env_options",
-    "test_docs",
-    "test_cuda_contacts",
-    "test_calibrate_command",
-    "test_bridge_run",
-    "test_procedure",
-    "test_calibration",
-    "test_identify_drives",
-    "test_rotate",
-    "test_motors_off",
-    "test_view",
-    "test_shipped_policies",
-    "test_env",
-    "test_drives",
-    "test_learning",
-    "test_train",
-    "test_check_hand",
-    "test_resume",
-    "test_sharding",
-    "test_twin_virtual",
-)
+LONGEST = """
+test_hand_tasks test_press_fit test_shipped_policy test_identification test_docs test_calibrate_command
+test_bridge_run test_procedure test_calibration test_identify_drives test_rotate test_motors_off test_view
+test_shipped_policies test_env test_engines test_randomization test_env_options test_drives test_learning
+test_train test_check_hand test_sharding test_twin_virtual
+""".split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
 

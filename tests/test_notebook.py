@@ -4,7 +4,6 @@ import ast
 import base64
 import importlib
 import io
-import os
 import re
 
 import numpy as np
@@ -94,10 +93,6 @@ def test_it_runs(name, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("DEXSIM_SMALL", "1")
-    if name != "motors":  # Small sizes are mostly compilation; a fit is not.
-        monkeypatch.setenv(
-            "XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace("optimization_level=1", "optimization_level=0")
-        )
     notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":

@@ -5,7 +5,6 @@ import importlib
 import json
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from paths import ROOT
 
@@ -90,54 +89,6 @@ class TestResuming:
         report = json.loads((here / "stub" / "b" / "report.json").read_text())
         assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
-    def test_another_setting_is_another_row(self, paper, here):
-        experiment, calls = stub(paper, training_seeds=0)
-        budget = paper.data.BUDGETS["cpu"]
-        paper.command.run(experiment, budget, here, here / "work")
-        changed = dataclasses.replace(experiment.rows[1], settings=("reward.force=1",))
-        other = dataclasses.replace(experiment, rows=(experiment.rows[0], changed, experiment.rows[2]))
-        assert set(paper.command.reports_of(other, here)) == {"a", "c"}
-        paper.command.run(other, budget, here, here / "work")
-        assert calls[3:] == [("b", 0)]
-        relabelled = dataclasses.replace(changed, label="another label", paper={"x": "1"})
-        assert paper.data.settings_of(relabelled) == paper.data.settings_of(changed)
-
-
-class TestTraining:
-    """A row's training goes through `train_policy`."""
-
-    @pytest.fixture
-    def trained(self, paper, monkeypatch):
-        calls = []
-
-        def train_policy(task=None, config=None, **options):
-            calls.append((task, config, options))
-            folder = options.get("run_dir") or options["resume"]
-            folder.mkdir(parents=True, exist_ok=True)
-            report = {"policy": "last.msgpack", "origin": {"env_steps": 7}, "hardware": {}, "command": "train"}
-            (folder / "report.json").write_text(json.dumps(report))
-
-        monkeypatch.setattr(paper.measure, "train_policy", train_policy)
-        return calls
-
-    def row(self, paper):
-        return next(row for row in paper.experiments.EXPERIMENTS["rewards"].rows if row.name == "torque")
-
-    def test_its_settings_reach_the_training(self, paper, trained, here):
-        from dexsim_ppo.train import preset_arguments
-
-        folder, budget = here / "seed2", paper.data.BUDGETS["cpu"]
-        file, found = paper.measure.train(self.row(paper), 2, budget, folder)
-        ((task, config, options),) = trained
-        assert (task, config.reward.force, config.reward.torque) == ("grasp", 0.0, 2.0)
-        assert file == folder / "last.msgpack" and found["env_steps"] == 7
-        # The entry point of users has all of these options.
-        default = preset_arguments(task, config, options.pop("preset"))
-        arguments = dataclasses.replace(default, **options)
-        assert (arguments.seed, arguments.minutes, arguments.backend) == (2, 20.0, "c")
-        paper.measure.train(self.row(paper), 2, budget, folder)
-        assert len(trained) == 1, "a finished training is not repeated"
-
 
 # --- what the rows are ----------------------------------------------------------------------------------
 
@@ -165,16 +116,6 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
 
 
 # --- objects that no training has seen ------------------------------------------------------------------
-
-
-class TestHeldOut:
-    def test_every_object_fits_into_the_slots(self, paper):
-        for name in paper.held_out.NAMES:
-            shape, parts = paper.held_out.shape_of(name), paper.held_out.CATALOGUE[name]["parts"]
-            assert shape["active"].sum() == len(parts)
-            assert np.linalg.norm(shape["quat"], axis=-1) == pytest.approx(1.0, abs=1e-5), name
-            assert np.all(shape["inertia"] > 0) and shape["inertia"].sum() > 2 * shape["inertia"].max(), name
-        assert len(paper.held_out.NAMES) == 24 and set(paper.held_out.HEAVY) < set(paper.held_out.NAMES)
 
 
 # --- tables ---------------------------------------------------------------------------------------------

@@ -47,27 +47,3 @@ def test_json_has_options_metrics_and_trials(zero_shot, tmp_path, monkeypatch, c
     found = json.loads(path.read_text(), parse_constant=pytest.fail)
     assert found["metrics"] == {"held": {"mean": None}} and found["trials"] == [{"trial": 0}]
     assert found["options"]["limit"] == {"speed": 20.0} and "held" in capsys.readouterr().out
-
-
-def test_losses_are_counted_by_cause_and_drawn_once_each(zero_shot, hand, tmp_path):
-    from zero_shot_metrics import draw_losses, metrics, table
-
-    part = {"kind": "box", "size": [0.0275] * 3, "place": [0.0, 0.0, 0.0]}
-    before = {
-        "joint_position": list(hand.rotate_posture),
-        "object_position": [0.05, 0.02, 0.11],
-        "object_quat": [0.95, 0.0, 0.3, 0.0],
-        "finger_force": [0.0, 0.0, 12.0, 0.0, 0.0],
-    }
-    counts = dict.fromkeys(("successes", "paper_successes", "seconds_to_fall"), 3) | {"joint_speed": 0.1}
-    report = {"task": "rotate", "command": 0.5, "parts": [part], "before": before, "fell": True, **counts}
-    ends = ["dropped: trapped", "dropped: trapped", "dropped: slipped"]
-    reports = [report | {"end": end} for end in ends] + [
-        {**counts, "task": "rotate", "fell": False, "end": "time limit"}
-    ]
-    found = metrics("rotate", "rotate", reports)
-    assert found["lost"] == {"trapped": 2, "slipped": 1}
-    assert "lost: trapped 2, slipped 1" in table(found, {}, {})
-    pictures = draw_losses(tmp_path, hand, reports)
-    assert [path.name for path in pictures] == ["rotate_trapped.png", "rotate_slipped.png"]
-    assert all(path.stat().st_size > 5000 for path in pictures)

@@ -1,5 +1,6 @@
 """The force loop around a policy, against closed forms; its estimate of force; the same on the bridge."""
 
+import copy
 import dataclasses
 
 import jax
@@ -107,7 +108,8 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
         def act(self, carry, observation):
             return carry, np.full(12, 0.2, np.float32)
 
-    state, controllers = grasp_rollout.reset(jax.random.key(3)), [Controller(Close(), hand) for _ in range(8)]
+    state, first = grasp_rollout.reset(jax.random.key(3)), Controller(Close(), hand)
+    controllers = [copy.copy(first) for _ in range(4)]  # which share what is compiled
     for index, controller in enumerate(controllers):
         controller.start(np.asarray(state.joint_target[index]))
     shown, wanted, nothing, sent, targets = [], [], np.zeros(1), [], []
@@ -126,7 +128,7 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
             wanted.append(float(row.command))
             sent.append(tick.target)
         state = grasp_rollout.step(state, jnp.full((8, 12), 0.2))
-        targets += list(np.asarray(state.joint_target))
+        targets += list(np.asarray(state.joint_target)[: len(controllers)])
     np.testing.assert_allclose(shown, wanted, atol=1e-6)
     np.testing.assert_allclose(sent, targets, atol=1e-5)
-    assert np.abs(np.asarray(state.correction)).max() > 0.02, "no hand has pressed"
+    assert np.abs(np.asarray(state.correction)[: len(controllers)]).max() > 0.02, "no hand has pressed"

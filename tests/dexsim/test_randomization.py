@@ -6,10 +6,9 @@ import functools
 import jax
 import numpy as np
 import pytest
-from ranges import draw_alone, range_paths
+from swapped import drawn, rollout
 
 from dexsim.core.errors import ConfigError
-from dexsim.objects.config import SIZE_RANGES
 from dexsim.randomization import Randomization, sample_hand
 
 TIMES = dict(timestep=0.005, control_period=0.03)
@@ -93,45 +92,22 @@ def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand):
         np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
 
 
-def test_latency_is_in_substeps_and_reaches_its_bound(hand):
-    latency = np.asarray(draws(hand, EVEN).latency)
-    assert latency.min() < 0.05 and 3.95 < latency.max() <= 4.0
-    assert np.all(latency == latency[:, :1])  # common to all joints
-    fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
-    np.testing.assert_allclose(fixed.latency, 3.0, rtol=1e-6)
+# --- held out, and in corners ------------------------------------------------------------------------
 
 
-# --- curriculum ------------------------------------------------------------------------------------
-
-
-def test_a_traced_scale_is_the_configured_one(hand):
-    """The scale may come from the training state: 0 is exactly nominal, and none of it recompiles."""
-    draw = jax.jit(lambda key, scale: sample_hand(key, Randomization(), hand, **TIMES, scale=scale))
-    key = jax.random.key(5)
-    for scale in (0.0, 0.5, 1.0):
-        other = sample_hand(key, Randomization(scale=scale), hand, **TIMES)
-        for ours, theirs in zip(jax.tree.leaves(draw(key, scale)), jax.tree.leaves(other), strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
-    nominal = draw(key, 0.0)
-    np.testing.assert_array_equal(nominal.actuator.stall_torque, hand.torque_limit)
-    np.testing.assert_array_equal(nominal.actuator.stiffness, np.full(12, 3.0, np.float32))
-    for zero in (nominal.latency, nominal.encoder_bias, nominal.actuator.coulomb_friction, nominal.actuator.ripple):
-        np.testing.assert_array_equal(zero, 0)
-    assert draw._cache_size() == 1
-
-
-# --- held out ----------------------------------------------------------------------------------------
+def ranges_of(hand, config):
+    """(name, draws, low, high, nominal) of all ranges but that of `ripple_count`, which has no nominal value."""
+    for name, values in quantities(hand, draws(hand, config)).items():
+        if name != "ripple_count":
+            span = getattr(config, name)
+            low, high = span if isinstance(span, tuple) else (-span, span)
+            nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+            yield name, np.asarray(values, float), low, high, nominal
 
 
 def test_held_out_hands_lie_outside_every_range(hand):
-    config = dataclasses.replace(EVEN, extremes=1.0, beyond=0.4)
-    found = quantities(hand, draws(hand, config))
-    for name in found.keys() - {"ripple_count"}:
-        values = np.asarray(found[name], float)
-        span = getattr(config, name)
-        low, high = span if isinstance(span, tuple) else (-span, span)
-        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
-        slack = 1e-6
+    slack = 1e-6
+    for name, values, low, high, nominal in ranges_of(hand, dataclasses.replace(EVEN, extremes=1.0, beyond=0.4)):
         assert np.all((values <= low + slack) | (values >= high - slack)), name
         far = 1.4 * max(high - nominal, nominal - low) + slack
         assert np.all(np.abs(values - nominal) <= far), name
@@ -141,33 +117,18 @@ def test_held_out_hands_lie_outside_every_range(hand):
         assert np.all(np.abs(values - nominal) > 1e-4), name
 
 
-# --- extremes -----------------------------------------------------------------------------------------
-
-
 def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
-    config = dataclasses.replace(EVEN, extremes=0.3)
-    drawn = draws(hand, config)
-    plain = draws(hand, EVEN)
-    at_end = {}
-    for name, values in quantities(hand, drawn).items():
-        if name == "ripple_count":
-            continue
-        span = getattr(config, name)
-        low, high = span if isinstance(span, tuple) else (-span, span)
-        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+    plain, corners = {name: values for name, values, *_ in ranges_of(hand, EVEN)}, None
+    for name, values, low, high, nominal in ranges_of(hand, dataclasses.replace(EVEN, extremes=0.3)):
         ends = [end for end in (low, high) if end != nominal]
-        values = np.asarray(values, float)
         near = np.min([np.abs(values - end) for end in ends], 0) < 1e-6 * max(1.0, abs(high))
-        at_end[name] = near.all(1)
-        assert near[at_end[name]].all()
-        sides = [np.mean(np.abs(values[at_end[name]] - end) < 1e-5) for end in ends]
+        corners = near.all(1) if corners is None else corners
+        np.testing.assert_array_equal(near.all(1), corners, err_msg=name)
+        sides = [np.mean(np.abs(values[corners] - end) < 1e-5) for end in ends]
         assert min(sides) > (0.4 if len(ends) == 2 else 0.99), name
         # Elsewhere the draw is what it is without extremes.
-        others = ~at_end["stiffness_factor"]
-        np.testing.assert_array_equal(values[others], np.asarray(quantities(hand, plain)[name], float)[others])
-    assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
-    for name, rows in at_end.items():
-        np.testing.assert_array_equal(rows, at_end["stiffness_factor"], err_msg=name)
+        np.testing.assert_array_equal(values[~corners], plain[name][~corners])
+    assert 0.25 < np.mean(corners) < 0.35
 
 
 # --- refusals ------------------------------------------------------------------------------------------
@@ -188,56 +149,34 @@ def test_refusals(values, word):
         Randomization(**values)
 
 
-# --- what each range reaches --------------------------------------------------------------------------
+# --- what each value that is drawn reaches ------------------------------------------------------------
 
-# By the names of the drive's parameters and of the compiled model's fields.
-RANGES = {
-    "randomization.stiffness_factor": "hand.actuator.stiffness",
-    "randomization.damping_factor": "hand.actuator.damping",
-    "randomization.dead_band": "hand.actuator.dead_band",
-    "randomization.torque_factor": "hand.actuator.stall_torque",
-    "randomization.speed_factor": "hand.actuator.no_load_speed",
-    "randomization.efficiency": "hand.actuator.efficiency",
-    "randomization.latency": "hand.latency",
-    "randomization.latency_spread": "hand.latency",
-    "randomization.ripple": "hand.actuator.ripple",
-    "randomization.ripple_count": "hand.actuator.ripple_count",
-    "randomization.coulomb_friction": "hand.actuator.coulomb_friction",
-    "randomization.viscous_friction": "hand.actuator.viscous_friction",
-    "randomization.sensing_latency": "hand.sensing_latency",
-    "randomization.encoder_bias": "hand.actuator.encoder_bias",
-    "randomization.torque_gain": "hand.torque_gain",
-    "randomization.taxel_gain": "hand.taxel_gain",
-    "randomization.gravity_tilt": "hand.tilt",
-    "randomization.pad_thickness_delta": "hand.pad_thickness_delta",
-    "sensing.orientation.bias": "imu.bias",
-    "sensing.orientation.drift": "imu.drift",
-    "sensing.orientation.delay": "imu.delay",
-    **{f"objects.{name}": "geom_size" for name in SIZE_RANGES},
-    "objects.mass": "body_mass",
-    "objects.inertia_scale": "body_inertia",
-    "objects.com_offset": "body_ipos",
-    "objects.friction": "pair_friction",
-    "objects.link_friction": "pair_friction",
-    "objects.stiffness": "pair_solref",
-    "objects.restitution": "pair_solref",
-}
-# In the readings, without effect on the motion.
+MOVING = """
+hand.actuator.stiffness hand.actuator.damping hand.actuator.dead_band hand.actuator.stall_torque
+hand.actuator.no_load_speed hand.actuator.efficiency hand.actuator.ripple hand.actuator.ripple_count
+hand.actuator.ripple_phase hand.actuator.encoder_bias hand.actuator.coulomb_friction hand.actuator.viscous_friction
+hand.latency hand.tilt hand.pad_thickness_delta object.mass object.inertia object.com object.friction
+object.link_friction object.contact object.size
+""".split()
+# In a reading, without effect on the motion.
 SENSED = {
-    "randomization.sensing_latency": "joint_position",
-    "randomization.torque_gain": "joint_torque",
-    "randomization.taxel_gain": "taxel_force",
-    "sensing.orientation.bias": "palm_gravity",
-    "sensing.orientation.drift": "object_quat",
-    "sensing.orientation.delay": "object_quat",
+    "hand.sensing_latency": "joint_position",
+    "hand.torque_gain": "joint_torque",
+    "hand.taxel_gain": "taxel_force",
+    "imu.bias": "palm_gravity",
+    "imu.drift": "object_quat",
+    "imu.delay": "object_quat",
 }
 
 
-def test_every_range_reaches_the_model_and_then_motion_or_readings(grasp_env, grasp_rollout):
+def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
     states = grasp_rollout.reset(jax.random.key(21))
-    assert set(range_paths(grasp_env)) == set(RANGES)
-    for path, leaf in RANGES.items():
-        changed, moved = draw_alone(grasp_env, grasp_rollout.step, states, path, ticks=9)
-        assert leaf in changed, path
-        assert moved[SENSED.get(path, "motion")] > 1e-6, path
-        assert (moved["motion"] == 0) == (path in SENSED), path
+    found, shows = drawn(states.episode), rollout(grasp_rollout.step, states, ticks=9)
+    # What belongs to a size, and the phase of an IMU that is as fast as the control.
+    silent = {"object.shape_index", "object.position", "object.active", "imu.phase"}
+    assert set(found) - silent == {*MOVING, *SENSED}
+    assert np.ptp(found["object.contact"], axis=0).min() > 0, "stiffness or damping of the contact is not drawn"
+    for path in MOVING:
+        assert "motion" in shows(path), path
+    for path, reading in SENSED.items():
+        assert reading in (moved := shows(path)) and "motion" not in moved, path

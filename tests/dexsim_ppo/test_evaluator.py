@@ -7,11 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from tiny_env import SMALL, TinyEnv
+from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import evaluate
-from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, summarize
 
@@ -27,7 +26,7 @@ class Totals(TinyEnv):
 
 @pytest.fixture(scope="module")
 def policy():
-    return Policy.from_training(TinyEnv(), SMALL, make_train(TinyEnv(), SMALL).init(jax.random.key(0)))
+    return Policy.from_training(TinyEnv(), SMALL, training_of().init(jax.random.key(0)))
 
 
 def test_whole_chunks_are_measured_and_the_seed_chooses_the_episodes(policy):

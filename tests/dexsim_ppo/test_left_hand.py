@@ -67,7 +67,8 @@ def test_both_hands_do_the_same_in_the_mirror(hand, left):
     runs = []
     for env, begin in zip(worlds, (start, mirror_start(start)), strict=True):
         step, act = jax.jit(env.step), jax.jit(lambda carry, obs, env=env: policy.act(carry, actor_of(env, obs)))
-        state, carry, run = env.reset_from(jax.random.key(0), begin, scale=jnp.zeros(())), policy.initial_carry(), []
+        reset = jax.jit(lambda key, begin, env=env: env.reset_from(key, begin, scale=jnp.zeros(())))
+        state, carry, run = reset(jax.random.key(0), begin), policy.initial_carry(), []
         for _ in range(round(SECONDS / env.control_period)):
             carry, action = act(carry, state.obs)
             state = step(state, action)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_env import SMALL, TinyConfig, TinyEnv
+from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.config import from_dict
 from dexsim.core.errors import CheckpointError, DexsimError
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy, load_policy
 
 TREE = {
@@ -35,7 +34,7 @@ def file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def policy():
     env = TinyEnv()
-    return Policy.from_training(env, SMALL, make_train(env, SMALL).init(jax.random.key(0)), {"seed": 0})
+    return Policy.from_training(env, SMALL, training_of().init(jax.random.key(0)), {"seed": 0})
 
 
 def equal(a, b):

@@ -1,6 +1,5 @@
 """Recorded episodes: readings and the targets that followed, to the end of each."""
 
-import dataclasses
 import sys
 import types
 
@@ -46,15 +45,6 @@ def test_readings_and_targets_are_those_of_the_episodes(env, compiled):
         memory, action = policy.act(memory, state.obs["actor"])
         state = step(state, action)
         np.testing.assert_allclose([one.target[tick] for one in found], state.joint_target, atol=2e-3)
-
-
-@pytest.mark.slow
-def test_an_episode_ends_with_its_drop(env):
-    policy = load_policy("grasp")
-    still = jax.tree.map(np.zeros_like, policy.params.layers)
-    idle = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=still))
-    lengths = [len(one.time) for one in record.record(idle, env, episodes=3, seconds=4.0, seed=0)[0]]
-    assert max(lengths) < round(4.0 / env.control_period), "a hand that does nothing drops the object"
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):

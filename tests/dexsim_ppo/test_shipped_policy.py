@@ -1,6 +1,7 @@
 """The policies in assets/policies: load without a simulator, fit today's tasks, act, hold and turn."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,12 @@ from episodes import reset_to
 
 import dexsim
 import dexsim_ppo
+from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
-from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
 from dexsim_ppo.policy import load_policy
 
@@ -79,62 +80,70 @@ def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
 WORLDS = 8
 
 
-def player(env):
-    """`play(states, seconds, policy)`: whether episodes failed [T, B], fingertip forces [T, B, F] N, and metrics.
+def play(env, step, states, seconds, policy=None):
+    """Whether episodes failed [T, B], fingertip forces [T, B, F] N, and metrics; a failure does not stop a world here.
 
-    Without a policy the hand gets no action. A failure does not stop a world here.
+    Without a policy the hand gets no action.
     """
-    step = jax.jit(jax.vmap(env.step))
-
-    def play(states, seconds, policy=None):
-        history, action = [], jnp.zeros((WORLDS, 12))
-        carry = policy and policy.initial_carry(WORLDS)
-        for _ in range(round(seconds / env.control_period)):
-            if policy is not None:
-                carry, action = policy.act(carry, states.obs["actor"])
-            states = step(states, action)
-            history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
-        return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
-
-    return play
+    history, action = [], jnp.zeros((WORLDS, 12))
+    carry, observe = policy and policy.initial_carry(WORLDS), policy and observer(env.hand, policy)
+    for _ in range(round(seconds / env.control_period)):
+        if policy is not None:
+            carry, action = policy.act(carry, observe(states.readings))
+        states = step(states, action)
+        history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
+    return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
 
 
-def test_the_grasp_holds_and_presses_as_asked():
+def observer(hand, policy):
+    """What the policy sees of readings, whatever the environment's own actor observes."""
+    config = from_dict(TASKS[policy.task].config_class, policy.env_config).observation
+    fields = SHIPPED[policy.task][0]
+    return jax.jit(jax.vmap(lambda readings: observation.observe(hand, readings, fields, config)))
+
+
+def test_the_grasp_holds_and_presses_as_asked(grasp_rollout):
     """Four seconds from four starts, each once with the lowest and once with the highest command.
 
     A hand that does nothing drops every object, so that holding says something.
     """
-    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
-    goals = GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
-    pairs = jnp.repeat(jnp.arange(WORLDS // 2), 2)
-    rows = jnp.array([1, 6, 11, 16])[pairs]  # of different shapes
-    starts = jit(jax.vmap(reset_to(env)), once=True)(
-        jax.random.split(jax.random.key(0), WORLDS // 2)[pairs], rows, goals
-    )
-    assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
-    play = player(env)
-    dropped, force, _ = play(starts, 4.0, load_policy("grasp"))
+    env, goals = grasp_rollout.env, GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
+    pairs = np.repeat(np.arange(WORLDS // 2), 2)
+    rows = np.unique(env.pool.object.shape_index, return_index=True)[1][pairs]  # of different shapes
+    keys = jax.random.split(jax.random.key(0), WORLDS // 2)[pairs]
+    starts = jit(jax.vmap(reset_to(env)), once=True)(keys, rows, goals)
+    dropped, force, _ = play(env, grasp_rollout.step, starts, 4.0, load_policy("grasp"))
     assert np.sum(~dropped.any(0)) >= 6
     late = force[len(force) // 2 :, :, 1:].sum(-1).mean(0)  # N, of the four fingers
     assert np.all(late[1::2] - late[::2] > 4.0), late
-    dropped, _, _ = play(starts, 4.0)
+    dropped, _, _ = play(env, grasp_rollout.step, starts, 4.0)
     assert np.all(dropped.any(0))
 
 
-@pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation", "rotate_clear"])
-def test_the_rotation_policies_turn(name):
-    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
+@functools.cache
+def rotation(name):
+    """The environment of a policy, and its compiled step."""
     policy = load_policy(name)
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
-    config = dataclasses.replace(config, pool_size=WORLDS)
-    env = dexsim.make(policy.task, config, backend="c")
+    env = dexsim.make(policy.task, dataclasses.replace(config, pool_size=WORLDS), backend="c")
+    return env, jit(jax.vmap(env.step), once=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "of"), [("rotate", "rotate"), ("rotate_without_orientation", "rotate"), ("rotate_clear", "rotate_clear")]
+)
+def test_the_rotation_policies_turn(name, of):
+    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none.
+
+    The policy without orientation was trained in the environment `of` the one with it.
+    """
+    env, step = rotation(of)
     starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
-    play = player(env)
-    dropped, _, metrics = play(starts, 4.0, policy)
+    dropped, _, metrics = play(env, step, starts, 4.0, load_policy(name))
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
     if name == "rotate":
-        _, _, metrics = play(starts, 4.0)
+        _, _, metrics = play(env, step, starts, 4.0)
         assert not metrics["successes"].any()
 
 

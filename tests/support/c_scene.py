@@ -23,24 +23,12 @@ GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
 CONVERGED = {"iterations": 50, "line_search": 50}
 COVER = 0.003  # m, rubber over the pads
+SETTLING = 0.03  # s, of the contacts' springs
 ROW = 3  # spheres along a pad
 KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.config.SLOTS`
 
 
-def compile_scene(
-    hand,
-    target,
-    *,
-    gravity=GRAVITY,
-    timestep=0.01,
-    iterations=3,
-    line_search=6,
-    condim=3,
-    margin=0.0,
-    exact=False,
-    settling=0.03,
-    cover=COVER,
-) -> mujoco.MjModel:
+def compile_scene(hand, target, *, iterations=3, line_search=6, margin=0.0, exact=False, cover=COVER) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
     Fingertips wear `cover` m of rubber; each of their three spheres presses with half of
@@ -71,15 +59,10 @@ def compile_scene(
         for name in names:
             tip = spec.geom(name).parent.name in tips
             slide = target.friction if tip else target.link_friction
-            spec.add_pair(
-                geomname1=name,
-                geomname2=KINDS[k],
-                condim=condim,
-                margin=margin,
-                friction=[slide, slide, 0.005, 1e-4, 1e-4],
-            )
+            friction = [slide, slide, 0.005, 1e-4, 1e-4]
+            spec.add_pair(geomname1=name, geomname2=KINDS[k], condim=3, margin=margin, friction=friction)
     option = spec.option
-    option.timestep, option.gravity = timestep, gravity
+    option.timestep, option.gravity = 0.01, GRAVITY
     option.iterations, option.ls_iterations = iterations, line_search
     option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_NEWTON
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 20.0
@@ -92,7 +75,7 @@ def compile_scene(
     model = spec.compile()
     # Contact softness is the skin's: that of a 0.1 kg object with 5e-5 kg m^2, whatever is held.
     model.body_invweight0[model.body("object").id] = 1 / 0.1, 1 / 5e-5
-    _set_springs(model, target, settling)
+    _set_springs(model, target)
     return model
 
 
@@ -115,7 +98,7 @@ def _clad(spec: mujoco.MjSpec, name: str, cover: float) -> list[str]:
     return [f"{name}/{k}" for k in range(ROW)]
 
 
-def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, felt, settling=0.03) -> None:
+def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, felt) -> None:
     """Give each fingertip's springs the stiffness with which they press as the skin does: sum K r = S.
 
     Depths r are those of C MuJoCo's own contacts; `felt` [F] N is S (`skin_law`).
@@ -126,11 +109,11 @@ def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, felt, 
     deep = np.where(second == model.body("object").id, np.maximum(-data.contact.dist, 0.0), 0.0)
     depth = np.array([deep[first == tip].sum() for tip in tips])
     ratio = np.clip((felt + 0.425) / (850 * depth + 0.425), 0.25, 4)  # 850 N/m, 0.5 mm
-    _set_springs(model, target, settling, dict(zip(tips, ratio, strict=True)))
+    _set_springs(model, target, dict(zip(tips, ratio, strict=True)))
 
 
-def _set_springs(model: mujoco.MjModel, target, settling: float, tips=None) -> None:
-    """The contact's stiffness in MuJoCo's terms: N = K r with aref = r / settling^2."""
+def _set_springs(model: mujoco.MjModel, target, tips=None) -> None:
+    """The contact's stiffness in MuJoCo's terms: N = K r with aref = r / SETTLING^2."""
     stiffness, ratio = (float(x) for x in target.contact)
     pairs = np.flatnonzero(model.geom_bodyid[model.pair_geom2] == model.body("object").id)
     links, first = model.geom_bodyid[model.pair_geom1[pairs]], model.geom_type[model.pair_geom1[pairs]]
@@ -138,8 +121,8 @@ def _set_springs(model: mujoco.MjModel, target, settling: float, tips=None) -> N
     spring = stiffness * np.where(first == mujoco.mjtGeom.mjGEOM_SPHERE, pad, 2.5)
     weight = model.body_invweight0[links, 0] + model.body_invweight0[model.body("object").id, 0]
     # mj_diagApprox and mj_makeImpedance: R = weight (1 - d) / d, and at rest N = aref / R.
-    d = weight / (weight + 1 / (settling**2 * spring))
-    model.pair_solref[pairs] = np.stack([-d / settling**2, -2 * ratio * d / settling], -1)
+    d = weight / (weight + 1 / (SETTLING**2 * spring))
+    model.pair_solref[pairs] = np.stack([-d / SETTLING**2, -2 * ratio * d / SETTLING], -1)
     model.pair_solimp[pairs] = np.stack([d, d, *np.tile([[0.001], [0.5], [2]], len(d))], -1)
 
 

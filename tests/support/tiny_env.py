@@ -5,6 +5,7 @@ from x, target ~ U(-1, 1) its return over 32 steps is 32 - E[sum of remaining di
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.adapter import Plan
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import Training, make_train
 
 # Learners: one that solves the task, and one that is quick to compile.
 CONFIG = PPOConfig(
@@ -137,3 +139,9 @@ class TinyEnv:
 
     def snapshot(self, state: TinyState) -> dict[str, jax.Array]:
         return {"x": state.x}
+
+
+@functools.cache
+def training_of(config: PPOConfig = SMALL, env_class: type[TinyEnv] = TinyEnv) -> Training:
+    """The learner on the environment, compiled once for all tests of a process."""
+    return make_train(env_class(), config)

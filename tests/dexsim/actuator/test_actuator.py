@@ -95,26 +95,6 @@ def test_a_delay_within_a_substep_is_the_mean_over_it():
 # --- ripple, encoder, friction ----------------------------------------------------------------------
 
 
-def test_ripple_is_a_wave_over_the_angle():
-    """Twenty waves a radian, of 5 % of the torque, whatever the torque; envelope and all."""
-    wavy = motor(ripple=0.05, ripple_count=20.0, ripple_phase=0.4)
-    position = np.linspace(0, 2, 400).astype(np.float32)
-    for target in (0.1, 5.0):
-        at = position + np.float32(target)
-        bare = joint_torque(motor(), at, 0.0, position, 1.0)
-        share = np.asarray(joint_torque(wavy, at, 0.0, position, 1.0)) / np.asarray(bare)
-        np.testing.assert_allclose(share, 1 + 0.05 * np.sin(20 * position + 0.4), atol=2e-6)
-
-
-def test_the_loop_sees_the_encoder():
-    """With a bias the joint comes to rest where the reading, not the joint, is at its target."""
-    biased = motor(encoder_bias=0.25, dead_band=0.125, damping=0.0)
-    assert float(joint_torque(biased, 1.0, 0.0, 0.75, 0.0)) == 0
-    assert float(joint_torque(biased, 1.0, 0.0, 1.0, 0.0)) == pytest.approx(-3 * 0.25)
-    assert float(joint_torque(biased, 1.0, 0.0, 0.5, 0.0)) == pytest.approx(3 * 0.25)
-    assert float(joint_torque(biased, 1.0, 0.0, 0.6875, 0.0)) == 0  # within the band of the reading
-
-
 def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velocity=0.0, steps=1000):
     """Velocities of a joint with nothing but friction, semi-implicit as the physics."""
     rubbing = motor(coulomb_friction=coulomb, viscous_friction=viscous)

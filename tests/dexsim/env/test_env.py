@@ -257,8 +257,8 @@ class TestTrouble:
     def test_a_world_that_blows_up(self, grasp_rollout, history):
         """It terminates, shows sober numbers, and the others never notice.
 
-        World 2 turns into NaN within the tick; world 5 gets motors that throw its joints to
-        speeds that are finite, but not of this world.
+        World 2 turns into NaN within the tick; world 5 gets motors that throw its joints to speeds that are finite,
+        but not of this world; worlds 1 and 6 get an action that is not a number.
         """
         state, action, following = history[3]
         object = dataclasses.replace(state.episode.object, mass=state.episode.object.mass.at[2].set(jnp.nan))
@@ -270,38 +270,27 @@ class TestTrouble:
             },
         )
         after = grasp_rollout.step(
-            with_episode(state, object=object, hand=dataclasses.replace(state.episode.hand, actuator=motors)), action
+            with_episode(state, object=object, hand=dataclasses.replace(state.episode.hand, actuator=motors)),
+            action.at[1, 0].set(jnp.nan).at[6].set(jnp.nan),
         )
-        bad, good = np.array([2, 5]), np.array([0, 1, 3, 4, 6, 7])
+        bad, good = np.array([1, 2, 5, 6]), np.array([0, 3, 4, 7])
         assert np.all(after.terminated[bad]) and not np.any(after.truncated[bad])
-        assert np.all(after.metrics["non_finite"][bad] == 1)
+        assert np.all(after.metrics["non_finite"][bad[1:3]] == 1)
         assert_same(after, following, good)
         assert not np.any(after.metrics["non_finite"][good])
         assert np.all(np.abs(after.reward) < 100)
-        for name in ("reward", "obs", "metrics", "physics"):
+        for name in ("reward", "obs", "metrics", "physics", "episode_return"):
             for path, value in leaves(getattr(after, name)).items():
                 assert np.all(np.isfinite(value)), (name, path)
         begun = grasp_rollout.restart(after, after.terminated)
         assert all(np.all(np.isfinite(value)) for value in leaves(begun).values())
 
-    def test_an_action_that_is_not_a_number(self, grasp_rollout, history):
-        """A broken policy must not poison rewards: such a world ends like one that blows up."""
-        state, action, following = history[3]
-        after = grasp_rollout.step(state, action.at[1, 0].set(jnp.nan).at[6].set(jnp.nan))
-        bad, good = np.array([1, 6]), np.array([0, 2, 3, 4, 5, 7])
-        assert np.all(after.terminated[bad])
-        assert_same(after, following, good)
-        for name in ("reward", "obs", "metrics", "episode_return"):
-            for path, value in leaves(getattr(after, name)).items():
-                assert np.all(np.isfinite(value)), (name, path)
-
 
 class TestReadings:
     def test_the_observation_is_observe_of_the_readings(self, hand, grasp_env, history):
         after = history[-1][2]
-        seen = jax.vmap(
-            lambda readings: observation.observe(hand, readings, observation.GRASP, grasp_env.config.observation)
-        )(after.readings)
+        observe = lambda r: observation.observe(hand, r, observation.GRASP, grasp_env.config.observation)  # noqa: E731
+        seen = jax.jit(jax.vmap(observe))(after.readings)
         np.testing.assert_allclose(after.obs["actor"], seen, rtol=1e-5, atol=1e-5)
         assert after.obs["actor"].shape == (WORLDS, 66)
         sizes = {name: sum(field.size for field in fields) for name, fields in grasp_env.observation_layout.items()}
@@ -319,7 +308,7 @@ class TestReadings:
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["joint_torque"], after.joint_torque, atol=1e-6)
         np.testing.assert_allclose(fields["contact_force"], after.taxel_force.sum(-1), rtol=1e-5, atol=1e-5)
-        tips = jax.vmap(lambda q: forward_kinematics(hand, q).tip_position)(after.physics.qpos[:, :12])
+        tips = jax.jit(jax.vmap(lambda q: forward_kinematics(hand, q).tip_position))(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
 

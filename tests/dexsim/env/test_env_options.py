@@ -1,26 +1,23 @@
-"""What an environment does beyond its defaults: imperfect taxels, added observations, scales."""
+"""What an environment does beyond its defaults: imperfect taxels, and a scale of the ranges."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ranges import draw_alone
 from simple_physics import SimplePhysics
+from swapped import drawn, rollout
 
 import dexsim
 from dexsim.core.compilation import jit
 from dexsim.objects.config import ObjectConfig
-from dexsim.observation import ObservationConfig
-from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
-from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 
-WORLDS = 4
-QUIET_TAXELS = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
+KEY = jax.random.key(0)
 POOR_TAXELS = TaxelSensor(
     hysteresis=(0.0, 0.3),
     crosstalk=(0.0, 0.1),
@@ -29,53 +26,26 @@ POOR_TAXELS = TaxelSensor(
     drift=(0.0, 0.005),
     dead=(0.0, 0.05),
 )
-QUIET = Sensing(
-    joint_noise=0.0,
-    joint_resolution=0.0,
-    torque_noise=0.0,
-    object_noise=0.0,
-    orientation=ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
-    taxel=QUIET_TAXELS,
-)
 
 
 @pytest.fixture(scope="module")
-def make():
-    """An environment over simple physics, quiet and nominal but for what is asked for."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-
-    def build(sensing=QUIET, randomization=None, observation=None):
-        return dexsim.make(
-            "grasp",
-            GraspConfig(
-                sensing=sensing,
-                randomization=randomization or Randomization(scale=0.0),
-                pool_size=4,
-                observation=observation or ObservationConfig(),
-                objects=ObjectConfig(shapes=("sphere",)),
-            ),
-            backend="c",
-        )
-
-    yield build
-    patch.undo()
-
-
-@pytest.fixture(scope="module")
-def drawn(make):
-    """An environment and 64 resets at three scales."""
-    env = make(dataclasses.replace(QUIET, taxel=POOR_TAXELS, orientation=ImuConfig()), Randomization())
-    draw = jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)), once=True)
-    return env, {scale: draw(jax.random.key(0), jnp.float32(scale)) for scale in (0.0, 0.5, 1.0)}
+def env():
+    """Over simple physics, with imperfect taxels."""
+    taxels = dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)
+    config = GraspConfig(sensing=Sensing(taxel=taxels), pool_size=4, objects=ObjectConfig(shapes=("sphere",)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+        return dexsim.make("grasp", config, backend="c")
 
 
 class TestScale:
     """A width of the ranges that is part of the state: 0 is nominal exactly, for hand, sensors and object."""
 
-    def test_zero_is_nominal(self, drawn, hand):
-        env, states = drawn
-        state, objects = states[0.0], env.config.objects
+    def test_zero_is_nominal(self, env, hand):
+        objects = env.config.objects
+        rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.arange(64) % 4], env.pool.object)
+        draw = jit(jax.vmap(lambda *given: env.sampler.sample(*given, jnp.float32(0))), once=True)
+        state = SimpleNamespace(episode=draw(*jax.random.split(jax.random.key(0), (3, 64)), rows))
         for value, nominal in (
             (state.episode.hand.actuator.stall_torque, hand.torque_limit),
             (state.episode.hand.encoder_bias, 0),
@@ -98,21 +68,23 @@ class TestScale:
         # A sphere is a capsule with a straight part of 0.2 mm.
         np.testing.assert_allclose(state.episode.object.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
 
-    def test_restarts_draw_at_the_states_scale(self, drawn):
-        env, states = drawn
-        state = jax.vmap(env.set_randomization_scale, (0, None))(states[1.0], jnp.float32(0.0))
-        np.testing.assert_array_equal(state.episode.hand.encoder_bias, states[1.0].episode.hand.encoder_bias)
-        begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(64) < 32)
-        assert np.all(np.asarray(begun.episode.hand.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
-        np.testing.assert_array_equal(begun.episode.hand.encoder_bias[32:], state.episode.hand.encoder_bias[32:])
-        np.testing.assert_array_equal(begun.episode.object.mass[:32], np.float32(np.mean(env.config.objects.mass)))
+    def test_restarts_draw_at_the_states_scale(self, env):
+        """Here of a state with ones everywhere: only what is done is drawn, and at the state's scale."""
+        shapes = jax.eval_shape(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8), jnp.ones(8)), KEY)
+        ones = lambda x: jnp.ones(x.shape, x.dtype)  # noqa: E731
+        is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+        state = jax.tree.map(lambda x: jax.random.split(KEY, x.shape) if is_key(x) else ones(x), shapes)
+        state = jax.vmap(env.set_randomization_scale)(state, jnp.zeros(8))
+        begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(8) < 4)
+        np.testing.assert_array_equal(begun.episode.hand.encoder_bias[:, 0], np.arange(8) >= 4)
+        np.testing.assert_array_equal(begun.scale, 0.0)
+        np.testing.assert_array_equal(begun.episode.object.mass[:4], np.float32(np.mean(env.config.objects.mass)))
 
 
-def test_every_range_of_taxels_reaches_their_readings_and_nothing_else(make):
-    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), Randomization())
-    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
-    step = jax.jit(jax.vmap(env.step))
-    for name in ("hysteresis", "hysteresis_time", "crosstalk", "gain", "bias", "drift", "dead", "rate"):
-        changed, moved = draw_alone(env, step, states, f"sensing.taxel.{name}", ticks=10)
-        assert changed == [f"taxels.{ {'hysteresis_time': 'memory', 'dead': 'alive'}.get(name, name) }"], name
-        assert [reading for reading, size in moved.items() if size > 0] == ["taxel_force"], name
+def test_every_error_of_taxels_reaches_their_readings_and_nothing_else(env):
+    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(KEY)
+    shows = rollout(jit(jax.vmap(env.step), once=True), states, ticks=10)
+    found = {path.removeprefix("taxels.") for path in drawn(states.episode) if path.startswith("taxels.")}
+    assert found == set("hysteresis memory crosstalk gain bias drift alive rate phase".split())
+    for name in found - {"phase"}:  # which shows late
+        assert shows(f"taxels.{name}") == ["taxel_force"], name

@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import reset_to
 
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.evaluation import Evaluation, evaluation_of
+from dexsim.env.evaluation import Evaluation
 from dexsim.env.state import Start
 
 MANY = 400
@@ -19,10 +18,13 @@ MANY = 400
 @pytest.fixture(scope="module")
 def drawn(simple_env):
     """The objects of `MANY` episodes from each row of the pool: leaves [8, MANY, ...]."""
-    reset = jit(
-        jax.vmap(jax.vmap(lambda key, row: reset_to(simple_env)(key, row).episode.object, (0, None))), once=True
-    )
-    return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
+
+    def draw(key, row):
+        object = jax.tree.map(lambda rows: jnp.asarray(rows)[row], simple_env.pool.object)
+        return simple_env.sampler.sample(*jax.random.split(key, 3), object).object
+
+    keys = jax.random.split(jax.random.key(5), (8, MANY))
+    return jit(jax.vmap(jax.vmap(draw, (0, None))), once=True)(keys, jnp.arange(8))
 
 
 def properties(object):
@@ -96,19 +98,6 @@ class TestPlan:
         plan = plan_of(count, 0)
         assert len(rows_of(plan.start.qpos)) == len(np.unique(plan.row)) == count
         assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
-
-    @pytest.mark.slow
-    def test_a_slice_of_a_plan_gives_its_episodes(self, simple_env):
-        """Of the real task: more episodes than its pool has rows, all from starts of their own."""
-        protocol = evaluation_of(simple_env)
-        plan = protocol.evaluation_plan(12, 0)
-        assert len(rows_of(plan.start.qpos) - rows_of(simple_env.pool.qpos)) == 12
-        starts = jit(protocol.evaluation_starts, once=True)
-        first, second = (starts(jax.tree.map(lambda leaf, i=i: leaf[i : i + 4], plan)) for i in (2, 4))
-        np.testing.assert_array_equal(first.physics.qpos, plan.start.qpos[2:6])
-        np.testing.assert_array_equal(first.episode.object.size, plan.start.object.size[2:6])
-        np.testing.assert_array_equal(first.goal.command, plan.goal.command[2:6])
-        np.testing.assert_array_equal(first.episode.object.mass[2:], second.episode.object.mass[:2])
 
 
 def rows_of(qpos):

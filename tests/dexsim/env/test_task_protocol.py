@@ -1,6 +1,7 @@
 """A task written from `dexsim.env.task.Task` alone: balance a ball on the upturned palm."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ class Balance(dexsim.Task):
 
     def make_pool(self, key):
         keys = jax.random.split(key, self.config.pool_size)
-        object = jax.vmap(lambda key: self.sample_object(key, self.config, jnp.int32(0)))(keys)
+        object = jax.jit(jax.vmap(lambda key: self.sample_object(key, self.config, jnp.int32(0))))(keys)
         rest = jnp.concatenate([jnp.zeros(self.hand.num_joints), jnp.array([*self.reference, 1.0, 0.0, 0.0, 0.0])])
         qpos = jnp.tile(rest, (len(keys), 1))
         return Start(qpos=qpos, qvel=jnp.zeros((len(keys), self.hand.num_joints + 6)), object=object)
@@ -95,14 +96,19 @@ def test_it_runs_from_reset_to_restart(env):
     """In `SimplePhysics` an object falls freely: it is lost after sqrt(2 reach / g), and the episode begins again."""
     state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
     assert state.obs["actor"].shape == (WORLDS, 12 + 5) and state.obs["critic"].shape == (WORLDS, 24)
-    step, restart = (jit(jax.vmap(one), once=True) for one in (env.step, env.restart))
+
+    @functools.partial(jit, once=True)
+    @jax.vmap
+    def advance(state, action):
+        after = env.step(state, action)
+        return after, env.restart(after, after.terminated)
+
     lost = int(np.ceil(np.sqrt(2 * env.config.reach / 9.81) / env.control_period))
     for tick in range(1, lost + 1):
-        state = step(state, jnp.zeros((WORLDS, env.action_size)))
+        state, again = advance(state, jnp.zeros((WORLDS, env.action_size)))
         np.testing.assert_array_equal(state.metrics["ticks"], tick - 1)  # of the goal that held during the tick
         np.testing.assert_array_equal(state.terminated, tick >= lost)
         np.testing.assert_allclose(state.reward, np.where(tick >= lost, -1.0, 1.0 - state.metrics["distance"]))
-    again = restart(state, state.terminated)
     assert not np.any(again.length) and not np.any(again.goal.ticks)
     np.testing.assert_allclose(again.physics.qpos[:, 12], env.config.height)
 

@@ -53,21 +53,6 @@ def test_distance_to_a_box_mesh_is_the_closed_form():
     np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
 
 
-def test_nearest_triangle_is_the_nearest_of_all():
-    """Against all triangles by dense sampling, on a shape with a hole and concave parts."""
-    ring = mesh.load_mesh(trimesh.creation.torus(0.03, 0.01, 32, 16))
-    points = np.random.default_rng(1).uniform(-0.06, 0.06, (200, 3))
-    value, _ = mesh.signed_distance(ring, points)
-    weight = np.array([[i, j, 12 - i - j] for i in range(13) for j in range(13 - i)]) / 12
-    samples = np.einsum("wc,tcd->twd", weight, ring.corners).reshape(-1, 3)
-    found = np.array([np.linalg.norm(samples - p, axis=1).min() for p in points])
-    assert np.all(found >= np.abs(value) - 1e-9) and np.all(found - np.abs(value) < 2.5e-4)
-    # The sign is that of the ring itself, but for the sliver between facets and curve.
-    across = np.hypot(np.linalg.norm(points[:, :2], axis=1) - 0.03, points[:, 2]) - 0.01
-    clear = np.abs(across) > 6e-4
-    assert np.all((value < 0)[clear] == (across < 0)[clear]) and (value < 0).sum() > 5
-
-
 def turned(part):
     part.invert()
     return part
@@ -103,16 +88,6 @@ def test_a_bad_mesh_is_an_error(word):
         mesh.load_mesh(bad_meshes()[word])
 
 
-def test_half_a_nanometre_apart_is_one_corner():
-    """On either side of a border of the cells that rounding makes."""
-    box = trimesh.creation.box((0.05, 0.05, 0.05))
-    corners = np.array(box.vertices[box.faces])  # as an STL has them
-    size = 1e-7 * 0.05
-    corners += (corners == 0.025) * (0.5 * size + 0.25e-9 * np.sign(np.arange(12) % 2 - 0.5))[:, None, None]
-    merged = mesh.load_mesh((corners.reshape(-1, 3), np.arange(36).reshape(12, 3)))
-    assert len(merged.vertices) == 8 and len(merged.faces) == 12
-
-
 def test_an_edge_of_four_triangles_is_named():
     box = trimesh.creation.box(2 * BOX)
     touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
@@ -130,11 +105,6 @@ def test_an_open_ball_is_closed_near_its_surface(repair, capsys):
     said = capsys.readouterr().err
     assert "the surface is open" in said and f"its {repair} is" in said
     mesh.check_sign(closed, count=50)  # of thousands of triangles
-
-
-def test_a_closed_mesh_is_not_repaired(capsys):
-    box = trimesh.creation.box(2 * BOX)
-    assert len(mesh.load_mesh(box, repair="shell").faces) == 12 and not capsys.readouterr().err
 
 
 def test_a_mesh_that_cuts_through_itself_cannot_be_signed():

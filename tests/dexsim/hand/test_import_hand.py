@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dexsim import check_hand, import_hand
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
-from dexsim.hand.fit import fit_capsule, fit_palm, segment_distance
+from dexsim.hand.fit import fit_capsule, segment_distance
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
@@ -165,27 +165,12 @@ def test_the_whole_command(tmp_path, capsys):
     np.testing.assert_allclose(nominal.actuator.damping, 0.1 / 1.1, rtol=1e-3)
 
 
-def test_an_imported_hand_can_be_mirrored(tmp_path, monkeypatch):
-    monkeypatch.delitem(check_hand.CHECKS, "random actions stay finite")  # it takes seconds
-    path = urdf(tmp_path)
-    for options in ([], ["--mirror"]):
-        out = str(tmp_path / "".join(["out", *options]))
-        assert import_hand.main([str(path), "--name", "left_one", "--out", out, "--yes", *options]) == 0
-    plain, mirrored = (load_hand(tmp_path / out / "left_one.toml") for out in ("out", "out--mirror"))
-    assert (plain.side, mirrored.side) == ("right", "left") and plain.grasp_posture == mirrored.grasp_posture
-    tips = [forward_kinematics(hand, np.float32(hand.grasp_posture)).tip_position for hand in (plain, mirrored)]
-    np.testing.assert_allclose(tips[1], np.asarray(tips[0]) * [1, -1, 1], atol=1e-6)
-
-
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size="0.015 0.05 0.05"/>
 {}</body></worldbody>{}</mujoco>"""
 CHAIN = """<body name="{0}" pos="0 {1} 0.05"><joint name="{0}_a" axis="0 1 0" range="0 1.5"/>
 <geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.03"/><body name="{0}b" pos="0 0 0.03">
 <joint name="{0}_b" axis="0 1 0" range="0 1.5"/><geom type="capsule" size="0.008" fromto="0 0 0 0 0 0.025"/></body>
 </body>"""
-ACTUATORS = """<actuator><position joint="thumb_a" forcerange="-0.4 0.4"/>
-<motor joint="f_a" ctrlrange="-1 1" gear="0.3"/>
-</actuator>"""
 TENDON = '<tendon><fixed name="cord"><joint joint="f_a" coef="1"/><joint joint="f_b" coef="1"/></fixed></tendon>'
 
 
@@ -194,12 +179,6 @@ def mjcf(folder, tail="", bodies=("thumb", "f", "g")):
     chains = "".join(CHAIN.format(name, 0.04 - 0.03 * i) for i, name in enumerate(bodies))
     path.write_text(MJCF.format(chains, tail))
     return path
-
-
-def test_torques_of_an_mjcf_stand_at_its_actuators(tmp_path):
-    source = read_description(mjcf(tmp_path, ACTUATORS))
-    torques = {link.joint.name: link.joint.torque for link in source.links[1:]}
-    assert torques["thumb_a"] == 0.4 and torques["f_a"] == pytest.approx(0.3) and torques["g_a"] == 0.0
 
 
 def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
@@ -252,11 +231,3 @@ def test_a_capsule_is_fitted_to_itself():
     steps = fit.ends[0] + np.linspace(0, 1, 2001)[:, None] * (fit.ends[1] - fit.ends[0])
     brute = np.linalg.norm(points[:, None] - steps, axis=-1).min(1)
     np.testing.assert_allclose(segment_distance(points, *fit.ends), brute, atol=1e-5)
-
-
-def test_mounts_do_not_raise_a_palms_face():
-    palm = trimesh.creation.box((0.03, 0.09, 0.1))
-    mount = trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02, 0.03, -0.03))
-    box = fit_palm(trimesh.util.concatenate([palm, mount]))
-    assert box.centre[0] + box.half[0] == pytest.approx(0.015, abs=1e-3)
-    np.testing.assert_allclose(box.half[1:], [0.045, 0.05], atol=2e-3)

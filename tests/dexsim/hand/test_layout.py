@@ -1,18 +1,14 @@
 """Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
 
-import shutil
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from shapes import solid
 
-from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.geometry import sdf
 from dexsim.hand import layout
-from dexsim.hand.load import load_hand
 
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])
@@ -55,26 +51,6 @@ def test_patches_lie_on_their_surface(kind, sizes, shape):
     assert np.all((chord > 2 * radius * np.sin(0.001 / radius) - 1e-9) & (chord < 0.002 + 1e-9))
     across = np.linalg.norm(np.diff(grid[:, 4], axis=0), axis=1)
     np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
-
-
-def test_the_hand_reads_what_was_written(tmp_path):
-    """A new skin for the shipped hand: 6 x 8 hexagonal taxels on capsules instead of its own."""
-    for name in ("xhand_right.xml", "xhand_right.toml"):
-        shutil.copy(asset_path(f"hand/{name}"), tmp_path / name)
-    toml = tmp_path / "xhand_right.toml"
-    toml.write_text(toml.read_text().replace("taxel_grid = [10, 12]", "taxel_grid = [6, 8]"))
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    points = layout.lattice(6, 8, pitch=0.0022, kind="hex")
-    patch = layout.on_surface("capsule", points, radius=0.009, half_length=0.006)
-    patch = layout.placed(patch, position=(0, 0, 0.025), rotation=turn)
-    patches = dict.fromkeys(("thumb", "index", "middle", "ring", "pinky"), patch)
-    layout.write_layout(tmp_path / "taxels.csv", patches)
-    hand = load_hand(toml)
-    assert hand.taxel_position.shape == (5, 48, 3) and hand.taxel_grid == (6, 8)
-    for finger in range(5):
-        np.testing.assert_allclose(hand.taxel_position[finger], patch.position, atol=6e-7)
-        np.testing.assert_allclose(hand.taxel_normal[finger], patch.normal, atol=2e-6)
-        np.testing.assert_allclose(hand.taxel_area[finger], patch.area, rtol=1e-5)
 
 
 def test_taxels_inside_the_link_are_refused(hand):

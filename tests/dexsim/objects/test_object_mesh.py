@@ -10,7 +10,7 @@ from simple_physics import SimplePhysics
 import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError
-from dexsim.geometry import distance, mesh, rotations, sdf
+from dexsim.geometry import distance, mesh, sdf
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
 from dexsim.objects.params import sample_object
@@ -72,18 +72,6 @@ class TestBoxes:
         error = np.abs(found - sdf.signed_distance(points, BARS))[outside]
         assert len(mesh_object.kinds) == 2 and error.mean() < 1e-5 and error.max() < 3e-4
         assert 0.3 < np.arccos(mesh_object.axes[0, 0]) < 0.8
-
-    @pytest.mark.slow
-    def test_principal_axes_are_found(self):
-        turn = rotations.quat_to_matrix(jnp.array([0.9, 0.2, -0.3, 0.25]) / np.linalg.norm([0.9, 0.2, -0.3, 0.25]))
-        sides, place = np.array([0.04, 0.06, 0.09]), np.array([0.5, -0.2, 0.1])
-        solid = trimesh.creation.box(sides)
-        moved = mesh.load_mesh((solid.vertices @ np.asarray(turn).T + place, solid.faces))
-        mesh_object = from_mesh(moved, 4)
-        np.testing.assert_allclose(mesh_object.origin, place, atol=1e-7)
-        np.testing.assert_allclose(mesh_object.axes, turn, atol=1e-5)  # no axis turned over or swapped
-        np.testing.assert_allclose(mesh_object.inertia, (np.sum(sides**2) - sides**2) / 12, rtol=1e-5)
-        np.testing.assert_allclose(mesh_object.boxes.size, [sides / 2], rtol=1e-3)
 
 
 class TestErrors:

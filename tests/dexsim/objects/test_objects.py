@@ -1,17 +1,17 @@
-"""Objects: mass properties by numerical integration, ranges, reach, and the contact spring's restitution."""
+"""Objects: mass properties against C MuJoCo, ranges and reach."""
 
 import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from shapes import bounds
 
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import (
-    damping_ratio,
     extent,
     sample_object,
     unit_inertia,
@@ -45,38 +45,17 @@ def row(drawn, at):
     return jax.tree.map(lambda x: x[at], drawn)
 
 
-# --- an independent account of the solids: thin slices along z ------------------------------------
-
-
-def slices(kind, size, count=20_001):
-    """Heights, areas and second moments (x, y) of a primitive's cross-sections, from its own centre."""
-    a, b, c = (float(s) for s in size)
-    if kind == "box":
-        z = np.linspace(-c, c, count)
-        area = np.full(count, 4 * a * b)
-        return z, area, area * a * a / 3, area * b * b / 3
-    if kind == "cylinder":
-        z = np.linspace(-b, b, count)
-        radius = np.full(count, a)
-    else:
-        z = np.linspace(-a - b, a + b, count)
-        radius = np.sqrt(np.maximum(a * a - np.maximum(np.abs(z) - b, 0) ** 2, 0))
-    area = np.pi * radius**2
-    return z, area, area * radius**2 / 4, area * radius**2 / 4
-
-
 def integrate(drawn):
-    """Mass, centre [3] and inertia [3] about it, of the active primitives at density one."""
-    parts = []
-    for slot in range(3):
-        if drawn.active[slot]:
-            z, area, xx, yy = slices(SLOTS[slot], drawn.size[slot])
-            z = z + float(drawn.position[slot, 2])
-            parts.append([np.trapezoid(v, z) for v in (area, area * z, area * z * z, xx, yy)])
-    mass, first, zz, xx, yy = np.sum(parts, axis=0)
-    centre = first / mass
-    zz -= mass * centre**2
-    return mass, centre, np.array([yy + zz, xx + zz, xx + yy])
+    """Mass, centre [3] and inertia [3] about it, of the active primitives at density one, by C MuJoCo."""
+    spec, turn = mujoco.MjSpec(), np.zeros(9)
+    body = spec.worldbody.add_body()
+    for slot in np.flatnonzero(drawn.active):
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{SLOTS[slot].upper()}")
+        body.add_geom(type=kind, size=drawn.size[slot], pos=drawn.position[slot], density=1.0)
+    model = spec.compile()
+    mujoco.mju_quat2Mat(turn, model.body_iquat[1])
+    axes = turn.reshape(3, 3)
+    return model.body_mass[1], model.body_ipos[1], np.diag(axes @ np.diag(model.body_inertia[1]) @ axes.T)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -87,7 +66,7 @@ def test_inertia_is_that_of_the_solid(name):
         one = row(drawn, at)
         mass, centre, inertia = integrate(one)
         np.testing.assert_allclose(one.inertia, inertia * one.mass / mass, rtol=2e-4)
-        assert abs(centre) < 1e-6  # the object's origin is its centre of mass
+        assert np.abs(centre).max() < 1e-6  # the object's origin is its centre of mass
         np.testing.assert_array_equal(one.position[:, :2], 0)
         seen.add(tuple(one.active.astype(int)))
     assert seen == ACTIVE[name]
@@ -170,18 +149,3 @@ def test_extent_is_the_bound_of_the_turned_shape():
 
 
 # --- the contact's damping -----------------------------------------------------------------------------
-
-
-def bounce(ratio, step=1e-5):
-    """Speed after over speed before contact with x'' = -2 z x' - x, which ends when that no longer pushes."""
-    x, v = 0.0, -1.0
-    while (push := -2 * ratio * v - x) > 0:
-        v += step * push
-        x += step * v
-    return v
-
-
-@pytest.mark.parametrize("restitution", [0.03, 0.9])
-def test_damping_ratio_bounces_as_it_should(restitution):
-    ratio = float(damping_ratio(jnp.float32(restitution)))
-    assert bounce(ratio) == pytest.approx(restitution, rel=0.01)

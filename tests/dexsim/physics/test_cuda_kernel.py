@@ -22,6 +22,8 @@ pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emu
 DATA = Path(__file__).parents[2] / "data"
 BOX = ("box",), np.array([[0.03, 0.03, 0.03]])
 ALL = ("box", "capsule", "cylinder"), np.array([[0.03, 0.03, 0.03], [0.025, 0.03, 0], [0.03, 0.03, 0]])
+MESH = ("box", "box"), np.full((2, 3), 0.03)
+EGG = ("ellipsoid", "box"), np.array([[0.03, 0.025, 0.035], [0.03, 0.03, 0.03]])
 
 
 def scene_of(hand: str, slots, largest, gravity=(-9.81, 0.0, 0.0)) -> PhysicsScene:
@@ -67,9 +69,12 @@ def test_states_of_the_shipped_policies(task, slots, largest, gravity):
         assert np.percentile(error["acceleration"], 90) < 0.01 * factor
 
 
-@pytest.mark.parametrize("hand", ["leap_like", "inspire_like"])
-def test_example_hands(hand):
-    scene = scene_of(hand, *ALL)
+@pytest.mark.filterwarnings("ignore:.*QACC")
+@pytest.mark.parametrize(("hand", "object"), [("leap_like", ALL), ("inspire_like", MESH), ("inspire_like", EGG)])
+def test_example_hands(hand, object, tmp_path, monkeypatch):
+    """Sphere, capsule, box and plane of the hand on all kinds of primitives. Boxes of a mesh also meet boxes."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working directory
+    scene = scene_of(hand, *object)
     states = tumble(scene, 64, near_palm)
     expected, outputs, error = compare(scene, states, 1)
     assert (expected["contacts"] > 0).mean() > 0.4 and np.linalg.norm(expected["finger_force"], axis=-1).max() > 1
@@ -232,3 +237,11 @@ def test_what_does_not_fit_is_named(before, after, message):
     assert BRANCHED.count(before) >= 1
     with pytest.raises(AssetError, match=message):
         cuda_scene.check_scene(branched_scene(BRANCHED.replace(before, after, 1)))
+
+
+def test_kinds_without_contacts_are_named():
+    text = BRANCHED.replace('<geom name="c1"', '<geom name="c1" type="cylinder"')
+    with pytest.raises(
+        AssetError, match="branched.xml: backend cuda has no contacts of .*cylinder 'c1' on capsule 'object'"
+    ):
+        cuda_scene.kernel_constants(branched_scene(text))

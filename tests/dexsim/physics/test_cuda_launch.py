@@ -57,30 +57,3 @@ def test_tasks_compile(task, compiler):
     assert code[:4] == b"\x7fELF"
     for name in (program.ENTRY, program.SHARED_BYTES):
         assert name.encode() in code
-
-
-class CountingCompiler(program.Compiler):
-    """A compiler that only counts."""
-
-    def __init__(self, version=(13, 0)):
-        self.version, self.calls = version, 0
-
-    def compile(self, text, included, options):
-        self.calls += 1
-        return f"{self.version} {text} {options}".encode()
-
-
-def test_compiled_code_is_kept(tmp_path, monkeypatch):
-    """By text, GPU, headers and compiler."""
-    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-    one, other = CountingCompiler(), CountingCompiler((13, 1))
-    monkeypatch.setattr(program, "find_compiler", lambda: one)
-    for text, architecture in (("a", "sm_90"), ("a", "sm_90"), ("b", "sm_90"), ("a", "sm_80")):
-        assert program.compile_kernel(text, architecture).startswith(f"(13, 0) {text}".encode())
-    assert one.calls == 3
-    monkeypatch.setattr(program, "headers", lambda: {"tick.cuh": "changed"})
-    program.compile_kernel("a", "sm_90")
-    assert one.calls == 4
-    monkeypatch.setattr(program, "find_compiler", lambda: other)
-    program.compile_kernel("a", "sm_90")
-    assert other.calls == 1

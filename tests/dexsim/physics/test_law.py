@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from dexsim.core.errors import ConfigError
-from dexsim.env.motors import JointCommand
 from dexsim.physics.cuda.law import print_law
-from dexsim.physics.law import evaluator, implicit, record
+from dexsim.physics.law import evaluator, record
 
 WORLDS, JOINTS = 16, 12
 SCALE, OFFSET = jnp.float32(1.7), jnp.linspace(-1.0, 1.0, JOINTS)
@@ -70,35 +69,6 @@ def moments(seed):
     return np.float32(random.uniform(-0.3, 1.2, (WORLDS, JOINTS))), np.float32(
         random.uniform(-12, 12, (WORLDS, JOINTS))
     )
-
-
-@WAYS
-def test_the_motors_are_jaxs(grasp_rollout, tmp_path, way):
-    env, keys = grasp_rollout.env, jax.random.split(jax.random.key(0), WORLDS)
-    states, recorded = jax.jit(jax.vmap(env.reset))(keys), []
-
-    def law_of(state):
-        target, valid = state.joint_target + 0.2, jnp.array(True)
-        command = JointCommand(action=0 * target, target=target, previous=state.joint_target, valid=valid)
-        return implicit(env.motors.law(state.episode.hand, command), env.config.physics.timestep)
-
-    def constants(state):
-        recorded.append(record(law_of(state), jnp.zeros(JOINTS)))
-        return recorded[-1].constants
-
-    values = [np.asarray(x) for x in jax.vmap(constants)(states)]
-    law = way(recorded[-1], values, tmp_path)
-    expected_of = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v), in_axes=(0, None, 0, 0)))
-    position, velocity = moments(0)
-    torques = []
-    for substep in range(3):
-        expected, inertia = expected_of(states, jnp.int32(substep), position, velocity)
-        torques.append(np.asarray(expected))
-        # Torques are differences of larger terms: the rate that friction sees, inertia / dt times velocity.
-        for result, value in zip(law(substep, position, velocity), (expected, inertia), strict=True):
-            np.testing.assert_allclose(result, value, rtol=2e-5, atol=2e-6)
-    assert np.abs(torques).max() > 0.05, "no torque: the test tests nothing"
-    assert np.any(torques[0] != torques[-1]), "no latency: the test does not test it"
 
 
 def every_operation(reach):

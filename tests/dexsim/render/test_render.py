@@ -16,7 +16,6 @@ from dexsim.geometry import sdf
 from dexsim.hand.load import load_hand
 from dexsim.render import picture, render
 from dexsim.render.camera import Camera, look
-from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
 from dexsim.render.picture import Primitives, cast
 from dexsim.render.snapshot import Snapshot
 
@@ -87,50 +86,6 @@ def test_rays_hit_the_surface_with_outward_normals(kind):
     np.testing.assert_allclose(depth, surface.depth[seen], rtol=1e-6)
 
 
-def test_a_sphere_projects_where_the_pinhole_formula_says_and_hides_what_is_behind():
-    camera = Camera(azimuth=0, elevation=0, distance=0.5, up=(-1, 0, 0), field_of_view=40)
-    view = look(camera, (300, 200))  # from +z: right = up x back = (-1, 0, 0) x (0, 0, 1) = (0, 1, 0)
-    centre, radius = np.array([0.03, -0.02, 0.05]), 0.02
-    scene = primitives(("box", [0.1, 0.1, 0.01], [0, 0, 0]), ("sphere", [radius, 0, 0], centre))
-    surface = cast(scene, view, view.rays())
-    rows, columns = np.nonzero(surface.primitive == 1)
-    focal, distance = 100 / np.tan(np.deg2rad(20)), 0.5 - 0.05
-    expected = 150 + focal * centre[1] / distance, 100 + focal * centre[0] / distance
-    np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], expected, atol=0.7)
-    seen_radius = focal * radius / np.sqrt(distance**2 - radius**2)
-    np.testing.assert_allclose(np.sqrt(len(rows) / np.pi), seen_radius, rtol=0.02)
-    np.testing.assert_allclose(surface.depth.min(), distance - radius, rtol=1e-3)
-    assert surface.primitive[100, 200] == 0  # beside the sphere, on the box
-
-
-def cell_box(layout, finger, column, row):
-    """Pixels (left, top, right, bottom; the last two exclusive) of one taxel's cell: the tip's row is at the top."""
-    x, y = layout.slots[finger]
-    left, top = x + column * layout.cell, y + int(1.3 * layout.font) + (layout.grid[1] - 1 - row) * layout.cell
-    return left, top, left + layout.cell - 1, top + layout.cell - 1
-
-
-def test_heat_map_cell_lies_where_documented():
-    layout = make_layout(240, 480, (10, 12), 5)
-    names = ("thumb", "index", "middle", "ring", "pinky")
-    for finger, column, row in ((0, 0, 0), (2, 9, 0), (3, 4, 11), (4, 7, 5)):
-        force = np.zeros((5, 120), np.float32)
-        force[finger, column * 12 + row] = 1.0
-        panel = draw_panel(layout, names, force, force.sum(1), {}, np.nan, 1.0, 1.0)
-        left, top, right, bottom = cell_box(layout, finger, column, row)
-        hot = force_color(np.array(1.0), 1.0)
-        assert np.all(panel[top:bottom, left:right] == hot)
-        lit = np.all(panel == hot, -1)
-        x, y = layout.slots[-1]
-        lit[y:, x:] = False  # the colour scale
-        assert lit.sum() == (right - left) * (bottom - top)
-    base, tip = cell_box(layout, 1, 0, 0), cell_box(layout, 1, 0, 11)
-    assert tip[1] < base[1] and tip[0] == base[0]  # the tip is at the top
-    assert cell_box(layout, 1, 9, 0)[0] > base[0]  # columns go right
-    image = taxel_image(np.arange(120), (10, 12))
-    assert image.shape == (12, 10) and image[0, 0] == 11 and image[11, 0] == 0 and image[11, 1] == 12
-
-
 def test_a_loaded_taxel_shows_on_the_finger(hand):
     """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
     cold = snapshot(hand, active=None)
@@ -148,20 +103,6 @@ def test_a_loaded_taxel_shows_on_the_finger(hand):
     pixel, _ = view.project(pose.taxel_position[finger, taxel])
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixel, atol=2)
     assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
-
-
-def test_taxels_outside_a_picture_change_nothing_in_it(hand):
-    """A narrow picture is the middle of a wide one, in which fingertips are to the left and right of it."""
-    force = np.ones(hand.taxel_position.shape[:2], np.float32)
-    hot, cold = (snapshot(hand, active=None, force=f) for f in (force, 0 * force))
-
-    def taxels(width):
-        frames = [render.render_frame(hand, KINDS, s, size=(width + 120, 240), force_range=1.0) for s in (hot, cold)]
-        return (frames[0] != frames[1]).any(-1)[:, :width]
-
-    narrow, wide = taxels(60), taxels(260)
-    np.testing.assert_array_equal(narrow, wide[:, 100:160])
-    assert narrow.any() and wide[:, :100].any() and wide[:, 160:].any()
 
 
 def quarter(axis):

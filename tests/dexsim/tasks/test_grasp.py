@@ -1,6 +1,5 @@
 """The grasp task's rules against hand-computed values; its start states against C MuJoCo."""
 
-import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -22,8 +21,6 @@ from dexsim.tasks.grasp.task import (
     Grasp,
     GraspGoal,
     command_reward,
-    joint_spread,
-    posture_distance,
 )
 from dexsim.touch.taxel_force import Touch
 
@@ -71,17 +68,6 @@ def goal_of(command):
 
 
 class TestTerms:
-    @pytest.mark.parametrize("thumb", ["loose", "binary"])
-    @pytest.mark.parametrize("value", [0.005, 0.5, 9.0, 200.5])
-    def test_command_reward_of_the_thumb(self, thumb, value):
-        weights = dataclasses.replace(WEIGHTS, thumb=thumb)
-        contact = jnp.array([True, False, False, False, False])
-        found = command_reward(jnp.full(5, value), 4.0, contact, (0.01, 200.0), 10.0, weights)
-        error = (value - 4.0) / 10.0
-        match = {"loose": gauss(error, 0.4), "binary": 1.0}[thumb]
-        wanted = match / 5 if 0.01 <= value <= 200.0 else 0.0
-        assert float(found) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
-
     def test_grasp_paper_has_the_papers_reward(self):
         """sigma 0.1 without a tail, thumb within bounds: R_force of the paper."""
         weights = paper().reward
@@ -90,10 +76,6 @@ class TestTerms:
             jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool), (0.01, 200.0), 10.0, weights
         )
         assert float(found) == pytest.approx((1 + 2 * math.exp(-0.5) + 1) / 5, rel=1e-5)
-
-    def test_penalties_at_their_edges(self):
-        assert float(joint_spread(jnp.zeros(0))) == 0.0  # a hand of one finger; NumPy's variance of nothing is NaN
-        assert jnp.isfinite(jax.grad(posture_distance)(jnp.ones(3), jnp.ones(3))).all()
 
 
 class TestReward:
@@ -172,18 +154,10 @@ class TestReward:
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
 
-    @pytest.mark.parametrize(
-        "offset, dropped",
-        [
-            ((0.119, 0, 0), False),
-            ((0, -0.121, 0), True),
-            ((0.08, 0.08, 0), False),
-            ((0.08, 0.08, 0.08), True),
-        ],
-    )
-    def test_dropped(self, hand, task, offset, dropped):
-        truth = make_moment(hand, object_position=np.array(CENTRE) + offset)
-        assert bool(task.dropped(goal_of(0.0), truth)) is dropped
+    def test_an_object_is_dropped_beyond_its_distance(self, hand, task):
+        places = [(0.119, 0, 0), (0, -0.121, 0), (0.08, 0.08, 0), (0.08, 0.08, 0.08)]
+        moments = [make_moment(hand, object_position=np.array(CENTRE) + place) for place in places]
+        assert [bool(task.dropped(goal_of(0.0), moment)) for moment in moments] == [False, True, False, True]
 
 
 class TestChance:
@@ -229,18 +203,9 @@ class TestRelease:
         fall = 0.5 * 9.81 * steps * (steps + 1) * env.config.physics.timestep**2
         np.testing.assert_allclose(np.array(heights[4:]) - heights[3], fall, rtol=0.02)
 
-    def test_delays_fill_their_range(self, hand):
-        task = Grasp(GraspConfig(release_delay=(0.1, 0.5)), hand)
-        keys = jax.random.split(jax.random.key(0), 500)
-        delay = np.asarray(jax.vmap(lambda key: task.begin(key, None).delay)(keys))
-        planned = np.asarray(task.evaluation_plan(500, np.arange(50) % 5)[1].delay)
-        for values in (delay, planned):
-            assert 0.1 <= values.min() < 0.12 and 0.48 < values.max() <= 0.5
-
 
 class TestEvaluationPlan:
-    @pytest.mark.parametrize("count", [25, 1024, 7])
-    def test_commands_and_shapes_are_spread_evenly(self, task, count):
+    def test_commands_and_shapes_are_spread_evenly(self, task, count=33):
         shape_index = np.sort(np.arange(400) % 5)
         index, goal = task.evaluation_plan(count, shape_index)
         command = np.asarray(goal.command)
@@ -274,17 +239,6 @@ class TestPool:
         assert np.bincount(pool.object.shape_index).tolist() == [16] * 5  # every shape has its share
         assert low - 1e-5 <= gap.min() and gap.max() <= high + 1e-5
         assert np.ptp(gap) > 0.7 * (high - low)
-
-    def test_ranges(self, hand, grasp_env):
-        pool, config = grasp_env.pool, grasp_env.config
-        joints = pool.qpos[:, :12]
-        assert np.all(joints >= hand.joint_lower) and np.all(joints <= hand.joint_upper)
-        curl, noise = joints - np.array(config.posture), 0.12 + 1e-6
-        assert np.all(np.abs(curl[:, :4]) <= noise)  # thumb and splay: noise alone
-        assert np.all(curl[:, 4:] >= config.curl[0] - noise)
-        assert np.all(curl[:, 4:] <= config.curl[1] + noise)
-        np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1.0, atol=1e-5)
-        assert not np.any(pool.qvel)
 
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))

@@ -65,43 +65,6 @@ def test_flat_punch():
     np.testing.assert_allclose(centre[0], 0, atol=1e-6)
 
 
-def winkler(skin, radius, depth):
-    """Force of a rigid sphere on an elastic foundation, Johnson section 4.3: pi K R d^2 / h."""
-    return np.pi * 6 * (skin.c10 + skin.c01) * radius * depth**2 / skin.thickness
-
-
-def sphere_lattice(radius, spacing):
-    """The lower half of a sphere of taxels, evenly spread."""
-    count = int(4 * np.pi * radius**2 / spacing**2)
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    points = radius * np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
-    low = points[:, 2] < 0
-    return points[None, low].astype(np.float32), np.full((1, low.sum()), 4 * np.pi * radius**2 / count, np.float32)
-
-
-@pytest.mark.parametrize(("spacing", "bound"), [(0.0003, 0.02), (0.0008, 0.10)])
-def test_sphere_in_a_box_face(spacing, bound):
-    """A spherical fingertip pressed into the face of a box, at 1 % compression, against Winkler.
-
-    Exact for a fine lattice: the depth below the face is d - R (1 - cos), and the integral over
-    the sphere is Winkler's. A coarse lattice adds sampling noise that grows with its pitch.
-    """
-    radius, depth, skin = 0.010, 0.0002, Skin(margin=0.0, thickness=0.02)
-    taxels, area = sphere_lattice(radius, spacing)
-    face = np.float32([0, 0, -radius + depth - 0.02])  # centre of a box whose top face is `depth` inside
-    touch = feel(taxels, area, solid("box", 0.03, 0.03, 0.02), face, EYE, np.float32([1.0]), skin)
-    total = float(touch.skin_force.sum())
-    assert total == pytest.approx(winkler(skin, radius, depth), rel=bound)
-    _, centre = reduce_touch(touch.force, taxels)
-    np.testing.assert_allclose(centre[0, :2], 0, atol=5 * spacing * bound)
-    assert centre[0, 2] == pytest.approx(-radius, abs=depth)
-    # Nothing feels beyond the contact radius sqrt(2 R d - d^2).
-    across = np.linalg.norm(taxels[0, :, :2], axis=1)
-    felt = np.asarray(touch.force[0]) > 0
-    assert across[felt].max() <= np.sqrt(2 * radius * depth - depth**2) + 1e-6
-
-
 @pytest.mark.parametrize(
     ("cover", "depth"),
     [

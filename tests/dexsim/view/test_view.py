@@ -13,12 +13,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import dexsim
 from dexsim.core.assets import asset_path
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
 from dexsim.render.picture import Pose, hand_poses
-from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
 from dexsim.view.simulation import NONE, PolicyShelf, Simulation
@@ -73,9 +71,8 @@ def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_
 
 
 @pytest.fixture(scope="module")
-def simulation():
-    env = dexsim.make("grasp", GraspConfig(pool_size=80, release_delay=(0.0, 0.0)), backend="c")
-    return Simulation(env, PolicyShelf(env, "grasp"), seed=3)
+def simulation(grasp_env):
+    return Simulation(grasp_env, PolicyShelf(grasp_env, "grasp"), seed=3)
 
 
 def run(source, ticks, **values):
@@ -193,24 +190,26 @@ for name in {recorded}:
         assert camera in ("grasp", "rotate") and int(frames) > 200 and (touching, jax) == ("True", "None")
 
 
-@pytest.mark.parametrize(
-    ("code", "message"),
-    [
-        ('main(["train"])', "dexsim train needs jax: pip install -e '.[train]'"),
-        ("import dexsim; dexsim.make", "dexsim.make needs jax: pip install -e '.[train]'"),
-        ("import dexsim_ppo; dexsim_ppo.load_policy", "dexsim_ppo.load_policy needs jax: pip install -e '.[train]'"),
-        ('main(["demo", "juggle"])', "showing juggle needs jax: pip install -e '.[train]'"),
-    ],
-)
-def test_what_the_base_install_cannot_do_names_the_extra(code, message):
-    (said,) = python_without_jax(f"""
+# What is asked for, and what must be said about it.
+NEEDS_JAX = {
+    'main(["train"])': "dexsim train",
+    "import dexsim; dexsim.make": "dexsim.make",
+    "import dexsim_ppo; dexsim_ppo.load_policy": "dexsim_ppo.load_policy",
+    'main(["demo", "juggle"])': "showing juggle",
+}
+
+
+def test_what_the_base_install_cannot_do_names_the_extra():
+    said = python_without_jax(f"""
 from dexsim.__main__ import main
-try:
-    {code}
-except Exception as error:
-    print(error)
+for code in {list(NEEDS_JAX)}:
+    try:
+        exec(code)
+    except Exception as error:
+        print(error)
 """)
-    assert said.startswith(message)
+    for line, what in zip(said, NEEDS_JAX.values(), strict=True):
+        assert line.startswith(f"{what} needs jax: pip install -e '.[train]'")
 
 
 def test_poses_for_pictures_are_those_of_the_kinematics(hand):
@@ -260,24 +259,21 @@ def wait_until(condition, seconds=25.0):
 
 
 @pytest.mark.slow
-def test_the_page_shows_the_hand(page):
+def test_the_page_shows_the_hand_and_its_buttons_work(page):
     from PIL import Image
 
     def colors():
         picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[100:, :450]
         return len(np.unique(picture.reshape(-1, 3), axis=0))
 
+    length = lambda: float(page.viewer.source._state.length)  # noqa: E731
     assert wait_until(lambda: colors() > 200), "the canvas stays empty"
-
-
-@pytest.mark.slow
-def test_pause_and_step(page):
     page.viewer.paused.value = True
     time.sleep(0.5)
-    at = float(page.viewer.source._state.length)
+    at = length()
     time.sleep(0.5)
-    assert float(page.viewer.source._state.length) == at
+    assert length() == at
     page.get_by_role("button", name="step").click()
-    assert wait_until(lambda: float(page.viewer.source._state.length) == at + 1)
+    assert wait_until(lambda: length() == at + 1)
     page.get_by_role("button", name="reset").click()
-    assert wait_until(lambda: float(page.viewer.source._state.length) == 0)
+    assert wait_until(lambda: length() == 0)

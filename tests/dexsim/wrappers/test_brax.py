@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from simple_physics import SimplePhysics
 from tiny_env import TinyConfig, TinyEnv
 
 import dexsim
@@ -61,42 +60,15 @@ def test_terminated_and_truncated_apart():
     assert len(set(starts.tolist())) == 2 and (np.abs(starts) <= 1.0).all()
 
 
-def train(env, num_timesteps, **options):
-    """brax's PPO at toy size; returns the metrics of each evaluation and the parameters."""
+@pytest.mark.slow
+def test_ppo_runs_on_grasp():
+    """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
     from brax.training.agents.ppo import networks
     from brax.training.agents.ppo import train as ppo
 
     history = []
-    factory = functools.partial(
-        networks.make_ppo_networks,
-        policy_obs_key="actor",
-        value_obs_key="critic",
-        policy_hidden_layer_sizes=(16,),
-        value_hidden_layer_sizes=(16,),
-    )
     _, params, _ = ppo.train(
-        env,
-        num_timesteps=num_timesteps,
-        wrap_env_fn=wrap,
-        normalize_observations=True,
-        num_updates_per_batch=2,
-        network_factory=factory,
-        num_evals=2,
-        progress_fn=lambda step, metrics: history.append(metrics),
-        **options,
-    )
-    return history, params
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("physics", ["simple", "c"])
-def test_ppo_runs_on_grasp(physics, monkeypatch):
-    """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
-    if physics == "simple":
-        monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
-    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
-    history, params = train(
-        BraxEnv(env),
+        BraxEnv(dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")),
         num_timesteps=3 * 8 * 4,
         episode_length=8,
         num_envs=8,
@@ -105,6 +77,12 @@ def test_ppo_runs_on_grasp(physics, monkeypatch):
         unroll_length=4,
         run_evals=False,
         discounting=0.97,
+        wrap_env_fn=wrap,
+        normalize_observations=True,
+        num_updates_per_batch=2,
+        network_factory=functools.partial(networks.make_ppo_networks, policy_obs_key="actor", value_obs_key="critic"),
+        num_evals=2,
+        progress_fn=lambda step, metrics: history.append(metrics),
     )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     assert np.isfinite(history[-1]["training/total_loss"])

@@ -11,8 +11,7 @@ from tiny_env import SMALL
 
 from dexsim import registry
 from dexsim.errors import ConfigError
-from dexsim_ppo import evaluate as evaluate_command
-from dexsim_ppo import evaluate_policy, load_policy, make_train, train_policy
+from dexsim_ppo import make_train
 from dexsim_ppo.learner.adapter import adapt
 
 
@@ -75,24 +74,3 @@ def test_make_train_adapts_and_leaves_complete_environments_alone():
     assert adapt(env, "other") is env and adapt(Reach()).name == "Reach"
     with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
         adapt({}, "nothing")
-
-
-@pytest.mark.slow
-def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, capsys):
-    config = dataclasses.replace(SMALL, num_envs=16)
-    sizes = {"evaluation_chunk": 16, "evaluation_episodes": 16}
-    run = train_policy("reach_env:reach", ppo=config, steps=16 * 8 * 4, run_dir=tmp_path / "run", seed=1, **sizes)
-    assert run.policy.task == run.report["task"] == "reach" and run.policy.control_rate == 10.0
-    assert run.report["trained"]["steps"] == MAX_STEPS and not (tmp_path / "run" / "policy.mp4").exists()
-    # Doing nothing leaves the point where it begins: half a metre off in the mean over its range.
-    idle = run.report["do_nothing"]
-    assert idle["held"]["value"] == 1.0 and 0.2 < idle["task"]["headline"]["distance"] < 0.8
-    assert idle["return"]["value"] == pytest.approx(MAX_STEPS * (1 - idle["task"]["headline"]["distance"]), rel=1e-4)
-    longer = train_policy("reach_env:reach", resume=tmp_path / "run", steps=16 * 8 * 8)
-    assert longer.policy.training["iteration"] == 8
-    report = evaluate_policy(load_policy(tmp_path / "run" / "last.msgpack"), episodes=16, chunk=16, seed=3)
-    code = evaluate_command.main(
-        [str(tmp_path / "run" / "last.msgpack"), "--task", "reach_env:reach", "--episodes", "16", "--chunk", "16"]
-        + ["--seed", "3", "--output", str(tmp_path / "report.json")]
-    )
-    assert code == 0 and f"{report['return']['value']:.4g}" in capsys.readouterr().out

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_env import CONFIG, SMALL, TinyEnv
+from tiny_env import CONFIG, SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo, update
-from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.learner.update import Learner
 from dexsim_ppo.policy import Policy
@@ -19,7 +18,7 @@ from dexsim_ppo.policy import Policy
 
 def test_reaches_the_known_return():
     """29 of the best possible 31.2 with exploration on."""
-    training = make_train(TinyEnv(), CONFIG)
+    training = training_of(CONFIG)
     state = training.init(jax.random.key(0))
     returns = []
     for _ in range(8):
@@ -30,20 +29,9 @@ def test_reaches_the_known_return():
     assert int(state.iteration) == 80
 
 
-def test_the_first_minibatch_sees_the_policy_that_collected():
-    """With one minibatch the update measures a ratio of exactly one, also after the normalisers have moved: it uses the
-    statistics of the collection, not those that include it."""
-    training = make_train(TinyEnv(), dataclasses.replace(SMALL, epochs=1, minibatches=1))
-    state = training.init(jax.random.key(0))
-    for _ in range(3):
-        state, metrics = training.step(state)
-        assert float(metrics["kl"][0]) < 1e-9 and float(metrics["clip_fraction"][0]) == 0
-        assert abs(float(metrics["policy_loss"][0])) < 1e-5
-
-
 def test_the_average_is_over_about_the_last_tenth():
     """Weights of iteration i count as binomial(i + 9, 9), which grows like i^9; a policy is made of them."""
-    training = make_train(TinyEnv(), dataclasses.replace(SMALL, iterations_per_call=1))
+    training = training_of()
     state = training.init(jax.random.key(0))
     kernels = []
     for _ in range(12):
@@ -56,36 +44,11 @@ def test_the_average_is_over_about_the_last_tenth():
     np.testing.assert_array_equal(policy.params.layers[0].kernel, state.average[0][0].kernel)
 
 
-def test_compiles_once():
-    env = TinyEnv()
-    training = make_train(env, SMALL)
-    state = training.init(jax.random.key(0))
-    traces = []
-    for _ in range(3):
-        state, _ = training.step(state)
-        traces.append(env.traces)
-    assert traces[0] == traces[-1]
-    assert training.step._cache_size() == 1
-
-
-def test_iterations_of_one_call_equal_single_calls():
-    run = []
-    for per_call in (1, 4):
-        config = dataclasses.replace(SMALL, iterations_per_call=per_call)
-        training = make_train(TinyEnv(), config)
-        state = training.init(jax.random.key(0))
-        for _ in range(4 // per_call):
-            state, _ = training.step(state)
-        run.append(state)
-    for a, b in zip(jax.tree.leaves(run[0].params), jax.tree.leaves(run[1].params), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
-
-
 def test_log_std_stays_between_floor_and_cap():
     config = dataclasses.replace(SMALL, learning_rate=1.0, learning_rate_max=1.0, kl_target=0.0)
-    state = make_train(TinyEnv(), config).init(jax.random.key(0))
+    state = training_of().init(jax.random.key(0))
     for sign, bound in ((1.0, config.std_min), (-1.0, config.std_max)):
-        learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
+        learner = Learner(state.params, state.adam, jnp.float32(config.learning_rate), state.skipped_updates)
         grads = jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), state.params)
         for _ in range(5):
             learner, _ = update.apply_gradients(config, learner, grads)
@@ -110,7 +73,7 @@ class BadRewards(TinyEnv):
 
 
 def test_a_diverging_environment_does_not_poison_the_learner():
-    training = make_train(BadRewards(), SMALL)
+    training = training_of(SMALL, BadRewards)
     state = training.init(jax.random.key(0))
     for _ in range(3):
         state, metrics = training.step(state)
@@ -165,9 +128,8 @@ def test_restarts_what_ended_and_nothing_else(length, block, share=0.3):
 
 def test_metrics_are_those_of_a_plain_loop():
     """Means over all steps, and over the last steps of episodes; what is not finite is left out and counted."""
-    env, count, length = BadRewards(), 6, 16
-    config = dataclasses.replace(SMALL, num_envs=count, rollout_length=length, minibatches=1)
-    state = make_train(env, config).init(jax.random.key(3))
+    env, count, config = BadRewards(), SMALL.num_envs, SMALL
+    state = training_of(config, BadRewards).init(jax.random.key(3))
     lengths = jnp.arange(count, dtype=jnp.float32) * 2.0
     begin = dataclasses.replace(state.env_state, metrics=state.env_state.metrics | {"length": lengths})
     state = dataclasses.replace(state, env_state=begin)

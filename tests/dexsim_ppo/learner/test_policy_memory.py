@@ -61,14 +61,6 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     assert error > 0.35 if kind == "none" else error < 0.1
 
 
-@pytest.mark.slow
-def test_the_update_begins_with_the_actions_probabilities_of_the_rollout():
-    _, _, samples, mean, value = experience("gru")
-    np.testing.assert_allclose(mean, samples.decision.mean, atol=1e-5)
-    np.testing.assert_allclose(value, samples.value, atol=1e-4)
-    assert np.std(mean) > 0.2, "actions that differ"
-
-
 def test_every_episode_begins_with_an_empty_memory_and_only_then():
     (_, last), rollout, *_ = experience("gru")
     ended = rollout.terminated | rollout.truncated
