@@ -112,6 +112,14 @@ def test_a_batch_is_drawn_as_one_picture_each(grasp):
     assert GymEnv(grasp).render() is None
 
 
+def test_a_learner_in_the_manner_of_cleanrl_learns_through_gymnasiums_wrappers():
+    pytest.importorskip("flax")
+    from cleanrl_ppo import train
+
+    returns = train(GymVectorEnv(TinyEnv(), 32, **NEXT_STEP), iterations=25)
+    assert returns[:64].mean() < 20 < 28 < returns[-64:].mean(), "of 31.2 at best"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

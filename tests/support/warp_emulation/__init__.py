@@ -72,9 +72,9 @@ class Emulation:
         return {buffer.name: arrays[buffer.name] for buffer in self.buffers if buffer.output}
 
 
-def build(text: str) -> Path:
-    """Compile `main.cpp` with a scene's text, or take what was compiled from the same sources."""
-    sources = [*sorted(_KERNEL.rglob("*.cuh")), _HERE / "warp_emulation.h", _HERE / "main.cpp"]
+def build(text: str, main: str = "main.cpp") -> Path:
+    """Compile `main` of this folder with a scene's text, or take what was compiled from the same sources."""
+    sources = [*sorted(_KERNEL.rglob("*.cuh")), _HERE / "warp_emulation.h", _HERE / main]
     digest = hashlib.sha256(text.encode() + b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
     library = _CACHE / f"{digest}.so"
     if not library.exists():
@@ -82,8 +82,8 @@ def build(text: str) -> Path:
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "scene_text.h").write_text(text)
             made = Path(folder) / "kernel.so"
-            command = [compiler, "-std=c++17", "-O1", "-w", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-Wl,-z,defs"]
-            command += [f"-I{folder}", f"-I{_HERE}", f"-I{_KERNEL}", str(_HERE / "main.cpp"), "-o", str(made)]
+            command = [compiler, "-std=c++17", "-O2", "-w", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-Wl,-z,defs"]
+            command += [f"-I{folder}", f"-I{_HERE}", f"-I{_KERNEL}", str(_HERE / main), "-o", str(made)]
             subprocess.run(command, check=True)
             shutil.move(made, library)
     return library
