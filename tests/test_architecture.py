@@ -63,19 +63,19 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 16_570,  # goal: 12,500
+    "dexsim": 16_580,  # goal: 12,500
     "dexsim/core": 900,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_640,  # goal: 1,900
     "dexsim/hand dexsim/objects": 3_050,  # goal: 1,900
     "dexsim/physics": 2_450,  # goal: 2,200, and 1,300 of CUDA
-    "dexsim/env dexsim/tasks": 2_670,  # goal, with the roots: 3,200
+    "dexsim/env dexsim/tasks": 2_680,  # goal, with the roots: 3,200
     ROOTS: 1_750,
     "dexsim/calibration dexsim/identification": 1_740,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_390,  # goal: 1,900
     "dexsim_ppo": 4_100,  # goal: 4,000
-    "dexsim_real": 10_000,  # goal: 6,500
+    "dexsim_real": 9_820,  # goal: 6,500
     "benchmarks": 2_320,
-    "tests": 24_370,  # goal: 18,000
+    "tests": 22_720,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
