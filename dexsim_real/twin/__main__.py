@@ -48,6 +48,8 @@ class TwinArguments(Config):
     """Seed of all random numbers: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
     """Number of trials, with one object each."""
+    first: int = setting(0, unit="1", low=0, high=100_000)
+    """Number of the first trial. A trial does not depend on the trials before it."""
     seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
     """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
     parameters: str = setting("outside", choices=KINDS)
@@ -129,7 +131,7 @@ class Twin:
         except BaseException:
             terminal.close()
             raise
-        self._trial = plant.trial
+        self._first = self._trial = plant.trial
         self._stop = False
 
     def stop(self) -> None:
@@ -180,7 +182,8 @@ class Twin:
     def _count_trials(self) -> None:
         if self.plant.trial == self._trial:
             return
-        self._trial = done = self.plant.trial
+        self._trial = self.plant.trial
+        done = self._trial - self._first
         self.note(f"end of trial {done} of {self.arguments.trials}: {self.plant.results()[done - 1].get('end', '')}")
         if done >= self.arguments.trials:
             self._stop = True
@@ -194,6 +197,7 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
         arguments.task,
         arguments.seed,
         trials=arguments.trials,
+        first=arguments.first,
         kind=arguments.parameters,
         seconds=arguments.seconds,
         plant_model=arguments.plant_model,
