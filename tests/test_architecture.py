@@ -73,9 +73,9 @@ BUDGETS = {
     "dexsim/calibration dexsim/identification": 1_740,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_390,  # goal: 1,900
     "dexsim_ppo": 4_100,  # goal: 4,000
-    "dexsim_real": 9_820,  # goal: 6,500
+    "dexsim_real": 9_830,  # goal: 6,500
     "benchmarks": 2_320,
-    "tests": 22_720,  # goal: 18,000
+    "tests": 22_840,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

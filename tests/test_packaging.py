@@ -1,12 +1,27 @@
 """The distribution: what importing costs, what the wheel holds, whether an installed copy works."""
 
 import re
+import subprocess
+import sys
 import tomllib
+import zipfile
+from pathlib import Path
 
 import pytest
 from paths import ROOT
 
+PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs a checkout")
+
+
+def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
+    """Run `code` in a fresh interpreter, with `path` in front of everything importable."""
+    start = f"import sys; sys.path.insert(0, {str(path)!r})\n" if path else ""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", start + code], cwd=cwd, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @in_checkout
@@ -14,6 +29,48 @@ def test_links_lead_somewhere():
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")):
         links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
         assert not [link for link in links if "://" not in link and not (page.parent / link).exists()], page
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The wheel, built from this checkout without fetching anything."""
+    if not (ROOT / "pyproject.toml").exists():
+        pytest.skip("needs a checkout")
+    out = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    (built,) = out.glob("*.whl")
+    return built
+
+
+@pytest.mark.slow
+def test_the_wheel_is_whole_and_works_from_another_directory(wheel, tmp_path):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    shipped = {name.removeprefix("dexsim/_assets/") for name in names if name.startswith("dexsim/_assets/")}
+    assets = [path for path in (ROOT / "assets").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert shipped == {str(path.relative_to(ROOT / "assets")) for path in assets}
+    assert all(f"{package}/py.typed" in names for package in PACKAGES)
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == set(PACKAGES)
+    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([*install, str(wheel)], check=True, capture_output=True, timeout=300)
+    code = """
+import dexsim, dexsim_ppo, dexsim_real
+from dexsim.core.assets import asset_path
+from dexsim.hand.load import load_hand
+load_hand()
+print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)), asset_path("hand/xhand_right.xml"))
+"""
+    files = run_python(code, elsewhere, site).split()
+    assert len(files) == 4 and all(Path(name).is_relative_to(site) for name in files), files
 
 
 def test_no_text_sends_people_to_the_name_of_another_project():
