@@ -55,10 +55,11 @@ def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> Tra
     """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
     normalisation that it was trained with."""
     stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
-    actor, memory = jax.tree.map(jnp.copy, (policy.params.layers, policy.params.memory))
+    learnt = policy.params.layers, policy.params.memory
+    (actor, memory), average = (jax.tree.map(jnp.copy, learnt) for _ in range(2))  # a step donates both
     return dataclasses.replace(
         state,
         params=dataclasses.replace(state.params, actor=actor, memory=memory),
-        average=(actor, memory),
+        average=average,
         observation_stats=state.observation_stats | {"actor": stats},
     )
