@@ -105,6 +105,8 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     if name != "auto" and name not in PRESETS:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     preset = find_preset(device_preset() if name == "auto" else name, task)
+    if task == "rotate" and preset.curriculum.on:  # Few steps: the first goals come after half as many without.
+        env_config = replace(env_config, trap=0.0)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.
         preset = replace(preset, extremes=0.0, ppo=replace(preset.ppo, memory="none"))
     return replace(preset, env=env_config, task=task)

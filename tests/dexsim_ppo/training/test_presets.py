@@ -64,6 +64,7 @@ def test_extremes_and_no_force_loop_are_for_training_alone():
     same = {"randomization": plain.env.randomization, "objects": plain.env.objects, "control": control}
     assert dataclasses.replace(trained, **same) == plain.env
     plain = preset_arguments("rotate", RotateConfig(), "cpu")
+    assert (plain.env.trap, preset_arguments("rotate", RotateConfig(), "gpu").env.trap) == (0.0, 0.25)
     assert training_config(plain) is plain.env, "by which an evaluation knows that it may use the same environment"
 
 
