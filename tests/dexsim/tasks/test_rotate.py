@@ -508,7 +508,7 @@ class TestEnvironment:
         """A still hand keeps the cube; counts start anew with the next episode."""
         env = rotate_env
         state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(jax.random.key(0))
-        assert state.obs["actor"].shape == (8, 65) and state.obs["critic"].shape == (8, 149)
+        assert state.obs["actor"].shape == (8, 92) and state.obs["critic"].shape == (8, 176)
         step, restart = (jit(jax.vmap(one), once=True) for one in (env.step, env.restart))
         for _ in range(30):
             state = step(state, jnp.zeros((8, 12)))
