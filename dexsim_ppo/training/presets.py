@@ -78,7 +78,8 @@ def find_preset(name: str, task: str) -> Preset:
     grasp, rotate, cpu = task.startswith("grasp"), task.startswith("rotate"), name != "gpu"
     if not (grasp or rotate):
         return preset
-    if cpu:  # Large steps find a skill, smaller ones refine it. They would end Pendulum's learning.
+    if cpu or task == "rotate_any":
+        # Large steps find a skill, smaller ones refine it. They would end Pendulum's learning.
         preset = replace(preset, ppo=replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150))
     if grasp:
         # A force follows its command within tenths of a second: a short horizon is enough, and learnt from fewer steps.
@@ -87,12 +88,9 @@ def find_preset(name: str, task: str) -> Preset:
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
         memory: Literal["none", "gru"] = "gru" if task in _FROM_MEMORY else "none"
-        preset = replace(preset, ppo=replace(ppo, num_envs=16384, memory=memory), minutes=5.0)
-        if task != "rotate_any":
-            return preset
-        # Its own ranges are wide enough to begin with: four times the goals after 120 million steps.
-        larger = replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150)
-        return replace(preset, extremes=0.0, ppo=larger)
+        # The ranges of `rotate_any` are wide enough without extremes: four times the goals after 120 million steps.
+        extremes = 0.0 if task == "rotate_any" else preset.extremes
+        return replace(preset, ppo=replace(ppo, num_envs=16384, memory=memory), minutes=5.0, extremes=extremes)
     curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":
