@@ -30,15 +30,15 @@ def test_the_preset_is_that_of_the_device(backend, cores, name, monkeypatch):
 COMMON = {"rollout_length": 16, "gae_lambda": 0.95, "clip_ratio": 0.2, "max_grad_norm": 1.0, "initial_std": 0.6}
 SMALL, LARGE = (128, 128), (256, 256, 128)
 # Environments, epochs, minibatches, discount, entropy bonus, first learning rate, target KL and its half-life, layers,
-# memory; minutes. Each is from training runs: change a number together with a record of one.
+# memory; minutes, million steps. Each is from training runs: change a number together with a record of one.
 TRAINED = {
-    ("cpu", "grasp"): (256, 5, 4, 0.97, 0.0, 1e-3, 0.04, 150, SMALL, "none", 7.0),
-    ("cpu", "rotate"): (512, 4, 16, 0.99, 0.001, 1e-3, 0.04, 400, SMALL, "none", 30.0),
-    ("cpu-large", "grasp"): (1024, 4, 16, 0.97, 0.0, 1e-3, 0.04, 150, SMALL, "none", 5.0),
-    ("cpu-large", "rotate"): (1024, 4, 16, 0.99, 0.001, 1e-3, 0.04, 400, SMALL, "none", 15.0),
-    ("gpu", "grasp"): (32768, 4, 16, 0.97, 0.004, 5e-4, 0.015, 0, LARGE, "gru", 8.0),
-    ("gpu", "rotate"): (16384, 4, 16, 0.99, 0.001, 5e-4, 0.015, 0, LARGE, "none", 5.0),
-    ("gpu", "rotate_any"): (16384, 4, 16, 0.99, 0.001, 1e-3, 0.04, 150, LARGE, "gru", 5.0),
+    ("cpu", "grasp"): (256, 5, 4, 0.97, 0.0, 1e-3, 0.04, 150, SMALL, "none", 7.0, 0),
+    ("cpu", "rotate"): (512, 4, 16, 0.99, 0.001, 1e-3, 0.04, 400, SMALL, "none", 30.0, 0),
+    ("cpu-large", "grasp"): (1024, 4, 16, 0.97, 0.0, 1e-3, 0.04, 150, SMALL, "none", 5.0, 0),
+    ("cpu-large", "rotate"): (1024, 4, 16, 0.99, 0.001, 1e-3, 0.04, 400, SMALL, "none", 15.0, 0),
+    ("gpu", "grasp"): (32768, 4, 16, 0.97, 0.004, 5e-4, 0.015, 0, LARGE, "gru", 0, 350),
+    ("gpu", "rotate"): (16384, 4, 16, 0.99, 0.001, 5e-4, 0.015, 0, LARGE, "none", 0, 250),
+    ("gpu", "rotate_any"): (16384, 4, 16, 0.99, 0.001, 1e-3, 0.04, 150, LARGE, "gru", 0, 250),
 }
 
 
@@ -48,8 +48,9 @@ def test_default_settings_are_those_that_trained_the_tasks(name, task):
     ppo = preset.ppo
     sizes = (ppo.num_envs, ppo.epochs, ppo.minibatches, ppo.discount, ppo.entropy_coefficient)
     rates = (ppo.learning_rate, ppo.kl_target, ppo.kl_halving)
-    assert (*sizes, *rates, ppo.actor_layers, ppo.memory, preset.minutes) == TRAINED[name, task]
-    assert ppo.critic_layers == ppo.actor_layers and preset.steps == 0
+    budget = (preset.minutes, preset.steps / 1e6)
+    assert (*sizes, *rates, ppo.actor_layers, ppo.memory, *budget) == TRAINED[name, task]
+    assert ppo.critic_layers == ppo.actor_layers
     assert {field: getattr(ppo, field) for field in COMMON} == COMMON
     assert preset.extremes == (0.6 if name == "gpu" and task != "rotate_any" else 0.0)
 
