@@ -125,7 +125,7 @@ _ORIENTATIONS = {
 """Error of the emulated hand's orientation [rad], and training's settings."""
 _OBJECTS = {
     "cube": ("edge=[0.055,0.055]",),
-    "sizes": ("edge=[0.045,0.065]",),
+    "sizes": ("edge=[0.045,0.065]", "pool_size=1024"),  # Few small cubes stay in the hand.
     "shapes": ('objects.shapes=["box","cylinder"]', "edge=[0.045,0.065]", "proportions=[0.9,1.1]"),
 }
 _ROUGH = ("push_probability=0.01", "push_speed=0.2", "objects.friction=[0.1,1.6]", "objects.link_friction=[0.1,1.2]")
