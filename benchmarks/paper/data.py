@@ -86,7 +86,8 @@ BUDGETS["long"] = dataclasses.replace(
     BUDGETS["gpu"],
     name="long",
     level=3,
-    training={"grasp": {"steps": 1.5e8, "evaluate_every": 0}, "rotate": {"steps": 1.5e8, "evaluate_every": 0}},
+    training={"grasp": {"steps": 1.5e8, "evaluate_every": 0}, "rotate": {"steps": 1e8, "evaluate_every": 0}},
+    trials={"grasp": 50, "rotate": 6},
 )
 
 

@@ -34,10 +34,10 @@ def _paper(name: str) -> dict[str, str]:
     return dict(zip(("mean / median / s each / s to fall", "sorted"), _PAPER[name], strict=True))
 
 
-def _observation_rows(task: str, also: tuple[str, ...] = ()) -> tuple[Row, ...]:
-    """The seven rows of the paper's table, trained on a task with these settings besides."""
+def _observation_rows(task: str) -> tuple[Row, ...]:
+    """The seven rows of the paper's table, trained on a task."""
     return tuple(
-        Row(name=name, label=label, task=task, settings=(*settings, *also), paper=_paper(name))
+        Row(name=name, label=label, task=task, settings=settings, paper=_paper(name))
         for name, (label, settings) in _OBSERVATIONS.items()
     )
 
@@ -162,15 +162,6 @@ _ALL = (
         name="observations",
         title="Observations of the rotation, our reward and success test",
         rows=_observation_rows("rotate"),
-        measure=measure.trained,
-        table=tables.rotation,
-        draw=figures.successes,
-        training_seeds=3,
-    ),
-    Experiment(
-        name="observations_paper",
-        title="Observations of the rotation, the paper's reward and success test",
-        rows=_observation_rows("rotate_paper", ("control.last_action_encoding=target", "skin.total=pressing")),
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
