@@ -78,8 +78,6 @@ def _sweep_rows() -> tuple[Row, ...]:
     return tuple(rows)
 
 
-# Targets as far beyond the thumb as the paper's are, without what our default adds to its reward.
-_PER_FINGER = ("finger_force=[2,7]", "max_force=10", "control.reach=0.5", "reward.overload=0", "control.force.gain=0")
 _RANGES = {
     "both": ("44.50–93.92", "1.09–1.52"),
     "force": ("37.29–70.02", "0.69–0.75"),
@@ -88,26 +86,25 @@ _RANGES = {
 """The paper's: of the contact force [N], and of the joint torque."""
 
 
-def _reward_rows(task: str, weights: dict[str, tuple[str, ...]], also: tuple[str, ...] = ()) -> tuple[Row, ...]:
-    labels = {"both": "R_force and R_torque", "force": "R_force alone", "torque": "R_torque alone"}
+def _reward_rows() -> tuple[Row, ...]:
+    """The paper's reward, and without either of its halves."""
+    rows = (
+        ("both", "R_force and R_torque", ()),
+        ("force", "R_force alone", ("reward.torque=0",)),
+        ("torque", "R_torque alone", ("reward.force=0",)),
+    )
     return tuple(
         Row(
             name=name,
-            label=labels[name],
-            task=task,
-            settings=(*settings, *also),
+            label=label,
+            task="grasp_paper",
+            settings=settings,
             paper=dict(zip(("force range [N]", "torque range"), _RANGES[name], strict=True)),
         )
-        for name, settings in weights.items()
+        for name, label, settings in rows
     )
 
 
-_REWARDS = {
-    "both": ("reward.force=2", "reward.torque=0.2"),
-    "force": ("reward.force=2", "reward.torque=0"),
-    "torque": ("reward.force=0", "reward.torque=2"),
-}
-_EXACT_REWARDS = {"both": (), "force": ("reward.torque=0",), "torque": ("reward.force=0",)}
 _READINGS = (
     ("nothing", "nothing ablated", ()),
     ("force", "contact force ablated", ("contact_force",)),
@@ -179,7 +176,7 @@ _ALL = (
     Experiment(
         name="exact_rewards",
         title="Rewards of the grasp, the paper's task exactly",
-        rows=_reward_rows("grasp_paper", _EXACT_REWARDS),
+        rows=_reward_rows(),
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
@@ -203,15 +200,6 @@ _ALL = (
         ),
         measure=measure.measured("simulation"),
         table=tables.rotation,
-    ),
-    Experiment(
-        name="rewards",
-        title="Rewards of the grasp",
-        rows=_reward_rows("grasp", _REWARDS, _PER_FINGER),
-        measure=measure.trained,
-        table=tables.grasp,
-        draw=figures.command_curves,
-        training_seeds=3,
     ),
     Experiment(
         name="force",

@@ -81,7 +81,8 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
                     axis.plot(command, middle, style, color=color, lw=1.5, label=text)
                     axis.fill_between(command, low, high, color=color, alpha=0.15, lw=0)
         axis.set(xlabel="force command", ylabel=label, ylim=(0, None))
-    axes[0, 0].legend(fontsize=7, frameon=False)
+    lines, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, labels, fontsize=7, frameon=False, loc="outside lower center", ncols=3)
     _save(figure, folder / "force_and_torque.svg")
 
 
