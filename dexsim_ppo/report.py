@@ -93,8 +93,3 @@ def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
     own = report["task"].get("headline") or {"held": report["held"] | {"unit": "%"}}
     rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in own.items()}
     return rows | {"return": report["return"]}
-
-
-def significantly_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:
-    """Which headline figures of the trained policy lie above those of the untrained one, interval above interval."""
-    return {name: trained[name]["low"] > untrained[name]["high"] for name in ("held", "return", "steps_held")}

@@ -3,7 +3,7 @@
     python -m dexsim_ppo.train --task grasp
 
 Writes `runs/<task>-<time>/`: configuration, metrics, checkpoints, best and last policy, learning curve, and at the end
-`report.json` (trained and untrained policy, same episodes) and a video. Ctrl-C saves; `--resume` continues exactly.
+`report.json` (the policy beside a hand that does nothing) and a video. Ctrl-C saves; `--resume` continues exactly.
 """
 
 import argparse
@@ -62,7 +62,7 @@ class TrainResult(NamedTuple):
     policy: Policy
     """The best policy by its evaluations during training, else the last one."""
     report: dict[str, Any]
-    """`report.json`: the trained against the untrained policy on the same episodes."""
+    """`report.json`: the policy beside a hand that does nothing, on the same episodes."""
     folder: Path
     """The run's folder."""
 

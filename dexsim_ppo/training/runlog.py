@@ -44,7 +44,6 @@ class RunFolder:
         self.checkpoints = path / "checkpoints"
         self.metrics = path / "metrics.jsonl"
         self.best, self.last = path / "best.msgpack", path / "last.msgpack"
-        self.untrained = path / "untrained.msgpack"
         self.report, self.config = path / "report.json", path / "config.json"
 
     def checkpoint(self, iteration: int) -> Path:
@@ -127,9 +126,8 @@ def new_folder(path: Path | None, task: str) -> Path:
 def folder_of(checkpoint: Path) -> Path:
     """The folder of the run that a checkpoint is of. Raises ConfigError if it lacks what a run needs at the end."""
     folder = RunFolder(checkpoint.resolve().parent.parent)
-    for file in (folder.config, folder.untrained):
-        if not file.exists():
-            raise ConfigError(f"--resume {checkpoint}: {folder.path} has no {file.name}, which a run needs")
+    if not folder.config.exists():
+        raise ConfigError(f"--resume {checkpoint}: {folder.path} has no {folder.config.name}, which a run needs")
     return folder.path
 
 

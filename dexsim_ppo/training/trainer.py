@@ -27,7 +27,7 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import headline, print_report, significantly_better, written
+from dexsim_ppo.report import headline, print_report, written
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.fine_tune import initialize_from
@@ -113,14 +113,13 @@ class Run:
         return place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
 
     def _initialize(self, state: TrainState, source: Policy | None) -> TrainState:
-        """The fresh state with what the policy to fine-tune has learnt; writes the untrained policy."""
+        """The fresh state with what the policy to fine-tune has learnt."""
         if source:
             fresh, state = state, initialize_from(source, self.config, state)
             if self.mesh is not None:
                 learned = lambda s: (s.params, s.average, s.observation_stats)  # noqa: E731
                 params, average, stats = place(learned(state), learned(fresh))
                 state = dataclasses.replace(state, params=params, average=average, observation_stats=stats)
-        self._write_policy(self._policy(state), self.folder.untrained)
         return state
 
     def _loop(self, state: TrainState, step: Callable, log: MetricsLog | None, stopped: Callable[[], int]) -> None:
@@ -261,23 +260,21 @@ class Run:
         return self.folder.best if self.folder.best.exists() else self.folder.last
 
     def finish(self, command: str) -> None:
-        """Evaluate trained and untrained policy and a hand that does nothing on the same episodes; write curve, report
-        and video.
+        """Evaluate the policy and a hand that does nothing on the same episodes; write curve, report and video.
 
         `command` is what started the run, for the report.
         """
         arguments, folder, selected = self.arguments, self.folder, self.selected
         first = "" if self.evaluations_s else "; the first evaluation compiles for about a minute"
-        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing{first}", flush=True)
+        print(f"evaluating {selected.name} and a hand that does nothing{first}", flush=True)
         begin = time.perf_counter()
-        trained, untrained = load_policy(selected), load_policy(folder.untrained)
+        trained = load_policy(selected)
         if trained.training.get("iteration") == 0:
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}
         reports["trained"], film = measure(trained.params, label="trained")
-        reports["untrained"], _ = measure(untrained.params, label="untrained")
-        reports["do_nothing"], _ = measure(untrained.params, idle=True, label="doing nothing")
+        reports["do_nothing"], _ = measure(trained.params, idle=True, label="doing nothing")
         self.clock["evaluation_s"] = time.perf_counter() - begin
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
@@ -287,7 +284,6 @@ class Run:
             "backend": self.env.backend,
             "seed": arguments.seed,
             **reports,
-            "better": significantly_better(reports["trained"], reports["untrained"]),
             "command": command,
             "arguments": printable(arguments),
             "timing": self.clock | {"total_s": time.perf_counter() - self.started},

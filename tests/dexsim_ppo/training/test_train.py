@@ -38,7 +38,7 @@ def finished(tmp_path_factory):
 
 
 def test_a_run_leaves_its_files(finished):
-    files = (finished.config, finished.metrics, finished.best, finished.last, finished.untrained, finished.report)
+    files = (finished.config, finished.metrics, finished.best, finished.last, finished.report)
     assert all(path.stat().st_size > 0 for path in (*files, finished.path / "curve.png"))
     rows = read_metrics(finished.metrics)
     assert [row["iteration"] for row in rows] == [1, 2, 4, 6], "the first, and every second"
@@ -49,7 +49,7 @@ def test_a_run_leaves_its_files(finished):
     config = json.loads(finished.config.read_text())
     assert config["arguments"]["ppo"]["num_envs"] == 16 and config["arguments"]["env"]["gain"] == 0.25
     report = json.loads(finished.report.read_text())
-    for name in ("trained", "untrained", "do_nothing"):
+    for name in ("trained", "do_nothing"):
         held = report[name]["held"]
         assert held["low"] <= held["value"] <= held["high"]
         assert report[name]["episodes"] == 16 and report[name]["seed"] == 0
