@@ -21,7 +21,6 @@ _TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
 _GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m to the right and up of the middle
 
 # Linear RGB.
-_SIDES = np.array([linear(color) for color in FACES])
 _IDLE_TAXEL = (0.08, 0.09, 0.1)
 _SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]])
 _BACKDROP = np.array([[0.040, 0.047, 0.060], [0.012, 0.014, 0.019]])  # middle, corners
@@ -43,8 +42,7 @@ class Primitives(NamedTuple):
     size: np.ndarray  # [G, 3], m
     position: np.ndarray  # [G, 3], m
     rotation: np.ndarray  # [G, 3, 3]
-    color: np.ndarray  # [G, 3], linear RGB
-    sides: bool = False  # whether sides +x, -x, +y, -y, +z, -z have the colours of `FACES` instead
+    color: np.ndarray  # [G, 6, 3], linear RGB of what faces +x, -x, +y, -y, +z, -z
 
 
 class Surface(NamedTuple):
@@ -122,7 +120,7 @@ def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
         np.array([geom.size for geom in geoms]),
         pose.body_position[body] + position,
         turn @ np.array([geom.rotation for geom in geoms]),
-        np.array([linear(tone) for tone in tones]),
+        np.array([[linear(tone)] * 6 for tone in tones]),
     )
 
 
@@ -130,13 +128,13 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
     """The object's active primitives, posed in the palm frame."""
     active = np.flatnonzero(frame.primitive_active)
     kind = tuple(kinds[k] for k in active)
+    tones = FACES if kind == ("box",) else (OBJECT,) * 6
     return Primitives(
         kind,
         frame.primitive_size[active],
         frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T,
         frame.object_rotation @ frame.primitive_rotation[active],
-        np.tile(linear(OBJECT), (len(active), 1)),
-        kind == ("box",),
+        np.tile([linear(tone) for tone in tones], (len(active), 1, 1)),
     )
 
 
@@ -188,17 +186,12 @@ def _paint(
     away = (1 - np.clip(-np.sum(normal * unit(rays[seen]), -1), 0, 1))[:, None]
     shade = _GROUND + (0.5 + 0.5 * normal @ up)[:, None] * (_SKY - _GROUND)
     shade += np.maximum(normal @ light, 0)[:, None] * _KEY
-    shade *= _face_colors(primitives, normal) if primitives.sides else primitives.color[index]
+    local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
+    axis = np.abs(local).argmax(-1)
+    shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
     shade += 0.1 * away**3  # a rim of light
     # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
     color[seen] += (opacity + (1 - opacity) * away**2) * (shade - color[seen])
-
-
-def _face_colors(box: Primitives, normal: np.ndarray) -> np.ndarray:
-    """The colour [M, 3] of the side of a box that each `normal` [M, 3] is of."""
-    local = normal @ box.rotation[0]
-    axis = np.abs(local).argmax(-1)
-    return _SIDES[2 * axis + (local[np.arange(len(axis)), axis] < 0)]
 
 
 def _paint_taxels(
