@@ -53,8 +53,6 @@ class ImportArguments(Config):
     """Folder to write."""
     mirror: bool = False
     """Write the mirror image: a left hand of a right one, or the other way round."""
-    name: str = ""
-    """The hand's name; empty for the folder's."""
     palm: str = ""
     """Body of the palm; empty for the one where all fingers begin."""
     thumb: str = ""
@@ -98,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     """Write a maker's hand into a folder: the TOML, and whether it passes its checks."""
-    name = arguments.name or re.sub(r"\W", "_", arguments.out.resolve().name)
+    name = re.sub(r"\W", "_", arguments.out.resolve().name)  # the folder's
     name = swap_sides(name) if arguments.mirror else name
     draft = read_hand(
         arguments.file,

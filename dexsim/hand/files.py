@@ -3,7 +3,6 @@
 import contextlib
 import hashlib
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 from dexsim.core.assets import asset_path
@@ -34,21 +33,9 @@ def shipped_name(path: Path) -> str:
 
 
 def digest_of(*files: Path) -> str:
-    """A hash of the content of a hand's files, and of the files that its MJCF includes, directly or not."""
+    """A hash of the content of a hand's files."""
     digest = hashlib.sha256()
     for path in files:
         data = path.read_bytes()
         digest.update(len(data).to_bytes(8, "little") + data)
-        for included in _included(path.parent, path.parent, data, set()):
-            digest.update(included.read_bytes())
     return digest.hexdigest()
-
-
-def _included(top: Path, folder: Path, data: bytes, seen: set[Path]) -> Iterator[Path]:
-    """The files that an MJCF in `folder` includes, and theirs. MuJoCo looks beside the model first, in `top`."""
-    for name in re.findall(rb"""<include\s+file\s*=\s*["']([^"']+)["']""", data):
-        places = [base / name.decode(errors="replace") for base in (top, folder)]
-        for path in [place for place in places if place.is_file() and place not in seen][:1]:
-            seen.add(path)
-            yield path
-            yield from _included(top, path.parent, path.read_bytes(), seen)

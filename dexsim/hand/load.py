@@ -111,6 +111,8 @@ def _load(path: Path, source: str) -> Hand:
     files = [path, path.parent / table.model]
     if not files[1].is_file():
         raise FileNotFoundError(2, "", str(files[1]))
+    if b"<include" in files[1].read_bytes():  # what changes there would go unnoticed
+        raise ConfigError(f"{table.model}: <include> is not supported: paste the file in its place")
     model = mujoco.MjModel.from_xml_path(str(files[1]))
     joints = [model.joint(name).id for name in table.joints]
     followers = _read_followers(model, joints)

@@ -247,20 +247,16 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
             bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
             raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
         return at
-    moving = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
-    paths = []
-    for body in moving:
-        if not any(other != body and is_below(model.body_parentid, other, body) for other in moving):
-            above = [body]
-            while above[-1]:
-                above.append(int(model.body_parentid[above[-1]]))
-            paths.append(above[::-1])
-    if len(paths) < 2:
-        raise ConfigError(f"expected a hand of two fingers or more, got {len(paths)} chains of hinges")
-    depth = 0
-    while all(len(chain) > depth + 1 and chain[depth + 1] == paths[0][depth + 1] for chain in paths):
-        depth += 1
-    return paths[0][depth]
+    chains: dict[int, list[int]] = {}
+    for body in {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}:
+        chains[body] = [body]
+        while chains[body][-1]:
+            chains[body].append(int(model.body_parentid[chains[body][-1]]))
+    inner = {above for chain in chains.values() for above in chain[1:]}
+    fingers = [chain for body, chain in chains.items() if body not in inner]
+    if len(fingers) < 2:
+        raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
+    return next(body for body in fingers[0] if all(body in chain for chain in fingers))
 
 
 def _read_followers(

@@ -13,6 +13,7 @@ from shapes import solid
 from dexsim.check_hand import check_taxels
 from dexsim.geometry import sdf
 from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
+from dexsim.hand.load import load_hand
 
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])
@@ -68,3 +69,19 @@ def test_a_sunk_taxel_is_named(hand):
     assert not check_taxels(hand)
     where = r"^finger 'index': taxel column 1, row 5 lies [34](\.\d)? mm inside its link \(1 of 120\)$"
     assert re.search(where, check_taxels(sunk))
+
+
+def test_taxels_of_a_pad_are_on_it_and_face_as_told():
+    hand = load_hand("leap_like")
+    assert hand.taxel_position.shape == (4, 48, 3)
+    for finger, facing in enumerate([(0, 0, 1), (1, 0, 0), (1, 0, 0), (1, 0, 0)]):
+        pad = next(g for g in hand.geoms if g.name == f"{hand.finger_names[finger]}_pad")
+        local = (hand.taxel_position[finger] - pad.position) @ pad.rotation
+        axis = np.clip(local[:, 2], -pad.size[1], pad.size[1])
+        out = local - axis[:, None] * [0, 0, 1]
+        np.testing.assert_allclose(np.linalg.norm(out, axis=1), pad.size[0], atol=1e-6)
+        np.testing.assert_allclose(hand.taxel_normal[finger] @ pad.rotation, out / pad.size[0], atol=1e-4)
+        middle = hand.taxel_normal[finger].mean(0)
+        assert middle @ facing / np.linalg.norm(middle) > 0.999
+        # 6 x 8 cells of 3.5 mm, of which those over the round end are smaller.
+        assert 0.95 < hand.taxel_area[finger].sum() / (48 * 0.0035**2) <= 1 + 1e-6

@@ -98,7 +98,7 @@ def test_a_mirror_image_moves_in_the_mirror_and_mirrored_twice_is_the_hand(tmp_p
 MODEL = """
 <mujoco model="right_parts">
   <compiler meshdir="../meshes" eulerseq="zYx"/>
-  <include file="parts/defaults.xml"/>
+  <default><default class="bent"><joint axis="0.2 1 0.3"/></default></default>
   <asset><mesh file="right_Wedge.obj"/></asset>
   <worldbody>
     <light pos="1 2 3" dir="0.1 0.2 -1"/>
@@ -123,19 +123,15 @@ MODEL = """
 
 
 def test_every_way_to_write_an_mjcf_is_mirrored(tmp_path):
-    """Orientations, frames, defaults, an included file and a mesh: masses, inertias and poses in C MuJoCo."""
+    """Orientations, frames, defaults and a mesh: masses, inertias and poses in C MuJoCo."""
     folder = tmp_path / "model"
-    (folder / "parts").mkdir(parents=True)
+    folder.mkdir()
     (tmp_path / "meshes").mkdir()
     (folder / "right.xml").write_text(MODEL)
-    (folder / "parts/defaults.xml").write_text(
-        '<mujoco><default><default class="bent"><joint axis="0.2 1 0.3"/></default></default></mujoco>'
-    )
     (tmp_path / "meshes/right_Wedge.obj").write_text(
         "v 0 0 0\nv .03 0 0\nv 0 .02 0\nv 0 .01 .04\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
     model = ElementTree.parse(folder / "right.xml").getroot()
-    mirror._paste_includes(model, folder, folder)
     for name, source in dict(mirror._gather_files(model, folder)).items():
         shutil.copyfile(source, tmp_path / name)
     mirror_mjcf(model)
