@@ -88,24 +88,19 @@ def draw_scene(
     force_range: float,
 ) -> np.ndarray:
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
-    view = look(camera, size, _SUPERSAMPLE)
-    rays = view.rays()
-    color = _backdrop(view.size).copy()
+    canvas = _Canvas(camera, size)
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
-
-    links = cast(body, view, rays)
-    _paint(color, body, links, links.primitive >= 0, rays, view, camera)
-    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view)
-    front = cast(held, view, rays)
-    _paint(color, held, front, front.depth < links.depth, rays, view, camera, _OBJECT_OPACITY)
+    links, front = canvas.cast(body), canvas.cast(held)
+    canvas.paint(body, links, links.primitive >= 0)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth)
+    canvas.paint(held, front, front.depth < links.depth, _OBJECT_OPACITY)
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
-    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view, _TAXEL_GLOW)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth, _TAXEL_GLOW)
     if frame.goal_rotation is not None:
         goal = goal_primitives(held, frame, camera)
-        marker = cast(goal, view, rays)
-        nearest = np.minimum(links.depth, front.depth)
-        _paint(color, goal, marker, marker.depth < nearest, rays, view, camera, _GOAL_OPACITY)
-    return _develop(color)
+        marker = canvas.cast(goal)
+        canvas.paint(goal, marker, marker.depth < np.minimum(links.depth, front.depth), _GOAL_OPACITY)
+    return canvas.develop()
 
 
 def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
@@ -168,60 +163,64 @@ def cast(primitives: Primitives, view: CameraView, rays: np.ndarray) -> Surface:
     return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
 
 
-def _paint(
-    color: np.ndarray,
-    primitives: Primitives,
-    surface: Surface,
-    seen: np.ndarray,
-    rays: np.ndarray,
-    view: CameraView,
-    camera: Camera,
-    opacity: float = 1.0,
-) -> None:
-    """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the picture,
-    linear RGB [H, W, 3]."""
-    index, normal = surface.primitive[seen], surface.normal[seen]
-    up = unit(np.asarray(camera.up, float))
-    light = unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])  # over the camera's right shoulder
-    away = (1 - np.clip(-np.sum(normal * unit(rays[seen]), -1), 0, 1))[:, None]
-    shade = _GROUND + (0.5 + 0.5 * normal @ up)[:, None] * (_SKY - _GROUND)
-    shade += np.maximum(normal @ light, 0)[:, None] * _KEY
-    local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
-    axis = np.abs(local).argmax(-1)
-    shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
-    shade += 0.1 * away**3  # a rim of light
-    # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
-    color[seen] += (opacity + (1 - opacity) * away**2) * (shade - color[seen])
+class _Canvas:
+    """A picture as it is painted, in linear light [H, W, 3], a colour for each of its rays."""
 
+    def __init__(self, camera: Camera, size: tuple[int, int]):
+        self.view = look(camera, size, _SUPERSAMPLE)
+        self.rays, self._color = self.view.rays(), _backdrop(self.view.size).copy()
+        self._up = unit(np.asarray(camera.up, float))
+        axes = self.view.axes
+        self._light = unit(0.55 * axes[0] + 0.75 * self._up + 0.75 * axes[2])  # over the camera's right shoulder
 
-def _paint_taxels(
-    color: np.ndarray,
-    pose: Pose,
-    force: np.ndarray,
-    force_range: float,
-    depth: np.ndarray,
-    view: CameraView,
-    glow: float | None = None,
-) -> None:
-    """The taxels that face the camera and that no link hides, as discs in the colour of their force [F, N] N; with
-    `glow` the loaded ones alone, laid over the picture with that weight. `depth` [H, W] m is that of the links."""
-    visible = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1) > 0
-    if glow is not None:
-        visible &= force > 0
-    level = force[visible]
-    hot = (force_color(level, force_range) / 255) ** 2.2
-    tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
-    pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
-    radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
-    width, height = view.size
-    for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
-        left, right = np.clip((int(x - r), int(x + r) + 2), 0, width)
-        top, bottom = np.clip((int(y - r), int(y + r) + 2), 0, height)
-        rows, columns = np.ogrid[top:bottom, left:right]
-        disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
-        disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT
-        part = color[top:bottom, left:right]
-        part[disc] += (1.0 if glow is None else glow) * (hue - part[disc])
+    def cast(self, primitives: Primitives) -> Surface:
+        """What of these each ray sees first."""
+        return cast(primitives, self.view, self.rays)
+
+    def paint(self, primitives: Primitives, surface: Surface, seen: np.ndarray, opacity: float = 1.0) -> None:
+        """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the
+        picture."""
+        index, normal = surface.primitive[seen], surface.normal[seen]
+        away = (1 - np.clip(-np.sum(normal * unit(self.rays[seen]), -1), 0, 1))[:, None]
+        shade = _GROUND + (0.5 + 0.5 * normal @ self._up)[:, None] * (_SKY - _GROUND)
+        shade += np.maximum(normal @ self._light, 0)[:, None] * _KEY
+        local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
+        axis = np.abs(local).argmax(-1)
+        shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
+        shade += 0.1 * away**3  # a rim of light
+        # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
+        self._color[seen] += (opacity + (1 - opacity) * away**2) * (shade - self._color[seen])
+
+    def paint_taxels(
+        self, pose: Pose, force: np.ndarray, force_range: float, depth: np.ndarray, glow: float | None = None
+    ) -> None:
+        """The taxels that face the camera and that no link hides, as discs in the colour of their force [F, N] N; with
+        `glow` the loaded ones alone, laid over the picture with that weight. `depth` [H, W] m is that of the links."""
+        view = self.view
+        visible = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1) > 0
+        if glow is not None:
+            visible &= force > 0
+        level = force[visible]
+        hot = (force_color(level, force_range) / 255) ** 2.2
+        tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
+        pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
+        radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
+        width, height = view.size
+        for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
+            left, right = np.clip((int(x - r), int(x + r) + 2), 0, width)
+            top, bottom = np.clip((int(y - r), int(y + r) + 2), 0, height)
+            rows, columns = np.ogrid[top:bottom, left:right]
+            disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
+            disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT
+            part = self._color[top:bottom, left:right]
+            part[disc] += (1.0 if glow is None else glow) * (hue - part[disc])
+
+    def develop(self) -> np.ndarray:
+        """sRGB bytes of the picture's pixels."""
+        height, width, _ = self._color.shape
+        n = _SUPERSAMPLE
+        light = self._color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
+        return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)
 
 
 @lru_cache(maxsize=4)
@@ -231,11 +230,3 @@ def _backdrop(size: tuple[int, int]) -> np.ndarray:
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     edge = np.clip((x**2 + y**2) / 1.6, 0, 1)[..., None]
     return _BACKDROP[0] + (_BACKDROP[1] - _BACKDROP[0]) * edge
-
-
-def _develop(color: np.ndarray) -> np.ndarray:
-    """Linear light of all rays [H, W, 3] as sRGB bytes of pixels."""
-    height, width, _ = color.shape
-    n = _SUPERSAMPLE
-    light = color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
-    return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)

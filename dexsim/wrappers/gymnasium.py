@@ -36,7 +36,6 @@ class GymVectorEnv(VectorEnv):
     Args:
       env: what `dexsim.make` returns.
       num_envs: environments side by side.
-      observation_group: "actor" or "critic".
       autoreset_mode: when a finished environment restarts. `SAME_STEP`: at once; `observation` is then the first of the
         new episode, and `info["final_obs"]` has the last of the old one. `NEXT_STEP`: in the step after, which ignores
         its action and earns nothing; Gymnasium's wrappers, such as `NormalizeObservation`, need this mode.
@@ -50,15 +49,14 @@ class GymVectorEnv(VectorEnv):
         self,
         env: Env,
         num_envs: int,
-        observation_group: str = "actor",
         *,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ):
         if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
             raise ConfigError(f"{autoreset_mode}: choose AutoresetMode.SAME_STEP or NEXT_STEP")
-        self.env, self.num_envs, self.render_mode, self._group = env, num_envs, render_mode, observation_group
-        size = sum(field.size for field in env.observation_layout[observation_group])
+        self.env, self.num_envs, self.render_mode = env, num_envs, render_mode
+        size = sum(field.size for field in env.observation_layout["actor"])
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -128,16 +126,14 @@ class GymVectorEnv(VectorEnv):
         return jax.vmap(self.env.restart)(last, ended.terminated | ended.truncated), last
 
     def _observation(self, state: Any) -> np.ndarray:
-        return np.array(state.obs[self._group])
+        return np.array(state.obs["actor"])
 
 
 class GymEnv(gymnasium.Env):
     """A single environment; arguments as of `GymVectorEnv`."""
 
-    def __init__(self, env: Env, observation_group: str = "actor", *, render_mode: str | None = None):
-        self._batch = GymVectorEnv(
-            env, 1, observation_group, autoreset_mode=AutoresetMode.NEXT_STEP, render_mode=render_mode
-        )
+    def __init__(self, env: Env, *, render_mode: str | None = None):
+        self._batch = GymVectorEnv(env, 1, autoreset_mode=AutoresetMode.NEXT_STEP, render_mode=render_mode)
         self.observation_space = self._batch.single_observation_space
         self.action_space = self._batch.single_action_space
         self.metadata, self.render_mode = self._batch.metadata, render_mode
