@@ -24,11 +24,10 @@ from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient, tip_of
 from dexsim.hand.description import Hand
-from dexsim.hand.files import find_hand
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import root_joint, write_hand
 from dexsim.hand.kinematics import fingertip_strength
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp, is_near
 from dexsim.hand.vendor import Draft, Link, read_hand

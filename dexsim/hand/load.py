@@ -1,19 +1,23 @@
 """The hand, read from an MJCF, a taxel layout and a short TOML: nothing in the library but the files under
 `assets/hand/` knows which hand it is."""
 
+import contextlib
 import dataclasses
+import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, Range, from_dict, naming_file, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
 from dexsim.hand.description import SHAPES, Geom, Hand
-from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.layout import MOST, lay_taxels, read_taxels
 
+DEFAULT = "xhand_right"
 _SLACK = 1e-3  # rad, how far a posture or a follower may be beyond a joint's range
 
 
@@ -80,6 +84,36 @@ class HandFile(Config):
     grasp: GraspEntry = GraspEntry()
     rotate: RotateEntry = RotateEntry()
     fingers: tuple[FingerEntry, ...]
+
+
+def find_hand(name: str | Path | None) -> Path:
+    """The TOML of a hand that is named by a path, or by the name of a shipped one; None for the default one."""
+    if not name:
+        return asset_path(f"hand/{DEFAULT}.toml")
+    text = str(name)
+    if re.fullmatch(r"\w+", text) and not Path(text).is_file():  # a folder of that name is no hand
+        for place in (f"hand/{text}.toml", f"hand/{text}/{text}.toml"):
+            with contextlib.suppress(AssetError):
+                return asset_path(place)
+        what = "a folder" if Path(text).is_dir() else "no such file"
+        raise AssetError(f"hand {text!r}: {what}, and no shipped hand has that name")
+    return Path(text)
+
+
+def shipped_name(path: Path) -> str:
+    """The name of the shipped hand whose TOML this is; empty for others."""
+    with contextlib.suppress(AssetError):
+        return path.stem if path.resolve() == find_hand(path.stem).resolve() else ""
+    return ""
+
+
+def digest_of(*files: Path) -> str:
+    """A hash of the content of a hand's files."""
+    digest = hashlib.sha256()
+    for path in files:
+        data = path.read_bytes()
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return digest.hexdigest()
 
 
 def load_hand(path: str | Path | None = None) -> Hand:

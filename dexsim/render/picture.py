@@ -9,8 +9,24 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.render.camera import Camera, CameraView, look, unit
-from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, linear
 from dexsim.render.panel import force_color
+
+# Of hand, object and goal, in the live view too: sRGB bytes.
+Color = tuple[int, int, int]
+
+PALM: Color = (62, 66, 72)
+LINK: Color = (172, 176, 182)
+TIP: Color = (58, 98, 92)
+OBJECT: Color = (52, 128, 172)
+FACES: tuple[Color, ...] = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (204, 121, 167),
+)
+"""Sides of a box, +x, -x, +y, -y, +z, -z: told apart also by eyes that see fewer colours (Okabe and Ito)."""
 
 _SUPERSAMPLE = 2  # rays a pixel, in each direction
 _FAR = 1e6  # m, the depth of a ray that hits nothing
@@ -24,6 +40,12 @@ _GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m
 _IDLE_TAXEL = (0.08, 0.09, 0.1)
 _SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]])
 _BACKDROP = np.array([[0.040, 0.047, 0.060], [0.012, 0.014, 0.019]])  # middle, corners
+
+
+def linear(color: Color) -> tuple[float, float, float]:
+    """A colour as linear light in [0, 1]."""
+    red, green, blue = (np.asarray(color) / 255) ** 2.2
+    return float(red), float(green), float(blue)
 
 
 class Pose(NamedTuple):

@@ -12,9 +12,8 @@ import trimesh
 
 from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.render.camera import look
-from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, Color
 from dexsim.render.panel import force_color
-from dexsim.render.picture import Pose, hand_poses
+from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, Pose, hand_poses
 from dexsim.render.render import camera_of
 from dexsim.view.source import Frame
 
