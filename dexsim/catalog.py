@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
-from dexsim.hand.files import DEFAULT
+from dexsim.hand.load import DEFAULT
 from dexsim.registry import TASKS
 
 

@@ -3,7 +3,7 @@
 python -m dexsim.check_hand my_hand.toml
 
 Beside what the files need in order to load, it checks the conventions that they follow: palm frame, signs of joints,
-reach of the first grasp, limits.
+reach of the first grasp, limits. A check returns what is wrong, and nothing of a sound hand.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,6 @@ from dexsim.env.state import State
 from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, hinge_angles
-from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.placement import clearance, palm_height
@@ -34,18 +33,17 @@ _POSES, _ENVS = 20, 16
 _NEAR, _ALIGNED = 1e-5, 1e-4  # m and rad, of link poses in float32
 TORQUES, SPEEDS = (0.02, 5.0), (0.3, 40.0)
 """Nm and rad/s: what motors of a hand have. A finger of 10 cm would press with 50 N."""
+_DEEP = 1.5e-3  # m, of a taxel in its link: pads are capsules fitted to the real skin
+_AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
+_STEP = 3e-3  # m, along a taxel's normal, which must lead away from the link
 _REACH = 0.06  # m, from the object's centre to the nearest fingertip
 _BALL, _OVERLAP = 0.022, 0.002  # m, radius of the smallest sphere of the default objects; depth that start states allow
 _UPRIGHT = 0.5  # share of an open finger's length along +z
 _SIDEWAYS = 0.01  # m, how far a thumb must be to a side for it to have one
 
 
-def check_kinematics(hand: Hand) -> None:
-    """Link poses against C MuJoCo at random joint angles.
-
-    Raises:
-      AssetError: a link is elsewhere or turned.
-    """
+def check_kinematics(hand: Hand) -> str:
+    """Link poses against C MuJoCo at random joint angles."""
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     palm, bodies = model.body(hand.palm).id, [model.body(name).id for name in hand.body_names]
@@ -61,52 +59,67 @@ def check_kinematics(hand: Hand) -> None:
         for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):
             if error.max() > limit:
                 name = hand.body_names[int(error.argmax())]
-                raise AssetError(f"{hand.model_path}: link {name!r} is {error.max():.3g} {unit} where MuJoCo has it")
+                return f"link {name!r} is {error.max():.3g} {unit} where MuJoCo has it"
+    return ""
 
 
-def check_fingertips(hand: Hand) -> None:
-    """Every fingertip has a primitive that touches the object.
-
-    Raises:
-      AssetError: one has none; a mesh does not count.
-    """
+def check_fingertips(hand: Hand) -> str:
+    """Every fingertip has a primitive that touches the object; a mesh does not count."""
     for name, body in zip(hand.finger_names, hand.tip_body, strict=True):
         if not any(geom.touches and geom.body == body for geom in hand.geoms):
-            raise AssetError(f"{hand.model_path}: finger {name!r} has no primitive at its tip that touches (no mesh)")
+            return f"finger {name!r} has no primitive at its tip that touches (no mesh)"
+    return ""
 
 
-def check_frame(hand: Hand) -> None:
-    """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of -y.
+def check_taxels(hand: Hand) -> str:
+    """The taxels of every finger are on the primitives of the link that carries them, and face outwards."""
+    for finger, name in enumerate(hand.finger_names):
+        parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.KINDS]
+        if not parts:
+            continue
+        poses = (np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation"))
+        shape = sdf.Shape(tuple(part.kind for part in parts), *poses, np.ones(len(parts), bool))
+        position, normal = hand.taxel_position[finger], hand.taxel_normal[finger]
+        distance, ahead = (np.asarray(sdf.signed_distance(position + s * normal, shape)) for s in (0.0, _STEP))
+        depth, away = -1e3 * distance.min(), 1e3 * distance.max()
+        for wrong, size, what in (
+            (distance < -_DEEP, -distance, f"lies {depth:.2g} mm inside its link"),
+            (distance > _AWAY, distance, f"is {away:.3g} mm away from its link: metres, in the link's frame?"),
+            (ahead <= distance, distance, "faces into its link: is the normal outward?"),
+        ):
+            if wrong.any():
+                column, row = divmod(int(np.argmax(np.where(wrong, size, -np.inf))), hand.taxel_grid[1])
+                count = f"{wrong.sum()} of {len(wrong)}"
+                return f"finger {name!r}: taxel column {column}, row {row} {what} ({count})"
+    return ""
 
-    Raises:
-      AssetError: a finger points elsewhere, or the thumb is on the other side.
-    """
+
+def check_frame(hand: Hand) -> str:
+    """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of
+    -y."""
     pose = forward_kinematics(hand, _open(hand))
     tips, bodies = np.asarray(pose.tip_position), np.asarray(pose.body_position)
     roots = np.array([bodies[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
     for name, arm in list(zip(hand.finger_names, tips - roots, strict=True))[1:]:
         if arm[2] < _UPRIGHT * np.linalg.norm(arm):
             way = ", ".join(f"{x:.2f}" for x in arm / np.linalg.norm(arm))
-            raise AssetError(
-                f"{hand.model_path}: finger {name!r} points along ({way}) with its joints at 0, expected +z: the frame "
+            return (
+                f"finger {name!r} points along ({way}) with its joints at 0, expected +z: the frame "
                 f"of body {hand.palm!r} must have fingers +z, palm normal +x"
             )
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
     if aside * hand.thumb_side < -_SIDEWAYS:
         sides = "-+" if hand.side == "right" else "+-"
-        raise AssetError(
-            f"{hand.model_path}: the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected "
-            f'{sides[1]}y of a {hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
+        return (
+            f"the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected {sides[1]}y of a "
+            f'{hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
         )
+    return ""
 
 
-def check_signs(hand: Hand) -> None:
+def check_signs(hand: Hand) -> str:
     """Positive angles close: a finger's tip moves toward the palm's normal from where it is open, the thumb's to where
-    its taxels face in the grasp.
-
-    Raises:
-      AssetError: names the joints that open.
-    """
+    its taxels face in the grasp."""
     opened, wrong = _open(hand), []
     grasp = np.asarray(hand.grasp_posture, np.float32) if hand.grasp_posture else opened
     for finger in range(hand.num_fingers):
@@ -120,55 +133,45 @@ def check_signs(hand: Hand) -> None:
             motion = jacobian[:, joint]
             if motion @ way < -0.2 * np.linalg.norm(motion) * np.linalg.norm(way):
                 wrong.append(hand.joint_names[joint])
-    if wrong:
-        raise AssetError(
-            f"{hand.model_path}: positive angles open {', '.join(wrong)}: they must close the finger, toward the "
-            "palm's normal +x; negate the joint's axis and range"
-        )
+    must = "they must close the finger, toward the palm's normal +x; negate the joint's axis and range"
+    return f"positive angles open {', '.join(wrong)}: {must}" if wrong else ""
 
 
-def check_reach(hand: Hand) -> None:
-    """The grasp's posture has a fingertip near the object's centre, and room for a ball between fingers and palm.
-
-    Raises:
-      AssetError: says how far away the tips are, or how deep the ball is in a link.
-    """
+def check_reach(hand: Hand) -> str:
+    """The grasp's posture has a fingertip near the object's centre, and room for a ball between fingers and palm."""
     if not hand.grasp_posture or not hand.grasp_centre:
-        raise AssetError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
+        return f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre"
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
     away = np.linalg.norm(np.asarray(forward_kinematics(hand, posture).tip_position) - centre, axis=-1)
     if away.min() > _REACH:
-        raise AssetError(
-            f"{hand.source}: [grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is "
-            f"{1e3 * away.min():.0f} mm from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is "
-            "in the palm frame"
+        return (
+            f"[grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is {1e3 * away.min():.0f} mm "
+            f"from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is in the palm frame"
         )
     centre[0] = palm_height(hand) + 0.005 + _BALL
     ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
     gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
     if gap < -_OVERLAP:
-        raise AssetError(
-            f"{hand.source}: [grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of "
-            f"{2e3 * _BALL:.0f} mm that lies at centre: open the posture or move centre"
+        return (
+            f"[grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm that lies "
+            "at centre: open the posture or move centre"
         )
+    return ""
 
 
-def check_limits(hand: Hand) -> None:
-    """Torques and speeds are those of a hand's motors.
-
-    Raises:
-      AssetError: names the joint with the least plausible one.
-    """
+def check_limits(hand: Hand) -> str:
+    """Torques and speeds are those of a hand's motors."""
     for what, values, (low, high), unit in (
         ("stall torque", hand.torque_limit, TORQUES, "Nm"),
         ("no-load speed", hand.speed_limit, SPEEDS, "rad/s"),
     ):
         odd = np.flatnonzero((values < low) | (values > high))
         if odd.size:
-            raise AssetError(
-                f"{hand.source}: joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
+            return (
+                f"joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
                 f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
             )
+    return ""
 
 
 def _open(hand: Hand) -> np.ndarray:
@@ -176,16 +179,12 @@ def _open(hand: Hand) -> np.ndarray:
     return np.clip(np.zeros(hand.num_joints, np.float32), hand.joint_lower, hand.joint_upper)
 
 
-def check_rollout(hand: Hand) -> None:
-    """Random actions in the grasp task, as fast as they may change, for a second.
-
-    Raises:
-      AssetError: the hand has no grasp, or something that it measures is not finite.
-    """
+def check_rollout(hand: Hand) -> str:
+    """Random actions in the grasp task, as fast as they may change, for a second: all that is measured is finite."""
     try:
         env = registry.make("grasp", GraspConfig(pool_size=_ENVS), hand=hand)
-    except ConfigError as error:
-        raise AssetError(str(error)) from None
+    except (AssetError, ConfigError) as error:
+        return str(error)
 
     def episode(key: jax.Array) -> jax.Array:
         begin, *keys = jax.random.split(key, 1 + round(1 / env.control_period))
@@ -197,11 +196,10 @@ def check_rollout(hand: Hand) -> None:
         return jax.lax.scan(step, env.reset(begin), jnp.stack(keys))[1]
 
     bad = np.asarray(jit(jax.vmap(episode), once=True)(jax.random.split(jax.random.key(0), _ENVS)))
-    if bad.any():
-        raise AssetError(f"{hand.model_path}: physics diverged in {np.sum(bad.any(1))} of {_ENVS} episodes")
+    return f"physics diverged in {np.sum(bad.any(1))} of {_ENVS} episodes" if bad.any() else ""
 
 
-CHECKS: dict[str, Callable[[Hand], None]] = {
+CHECKS: dict[str, Callable[[Hand], str]] = {
     "kinematics agree with MuJoCo": check_kinematics,
     "fingertips touch": check_fingertips,
     "taxels are on the skin": check_taxels,
@@ -242,19 +240,16 @@ def report(path: Path) -> tuple[list[str], bool]:
     except AssetError as error:
         return [f"FAIL  files load: {error}"], False
     lines = [f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels"]
-    lines += describe(hand)
-    lines.append("ok    files load")
+    lines += [*describe(hand), "ok    files load"]
     passed = True
     for name, check in CHECKS.items():
         if check is check_rollout and not passed:
             lines.append(f"-     {name}: not tried")
-            continue
-        try:
-            check(hand)
-            lines.append(f"ok    {name}")
-        except AssetError as error:
-            lines.append(f"FAIL  {name}: {error}")
+        elif wrong := check(hand):
+            lines.append(f"FAIL  {name}: {wrong}")
             passed = False
+        else:
+            lines.append(f"ok    {name}")
     return lines, passed
 
 

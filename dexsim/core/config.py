@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
-_LARGEST = 2**63 - 1  # of an integer in a checkpoint
 Range = Annotated[tuple[float, float], "low and high, in order"]
 """The type of a field that is a range (low, high)."""
 
@@ -29,8 +28,8 @@ def setting(
     default: Any = dataclasses.MISSING,
     *,
     unit: str = "",
-    low: float | None = None,
-    high: float | None = None,
+    low: float = -math.inf,
+    high: float = math.inf,
     choices: Collection[str] | None = None,
     nominal: float | None = None,
 ) -> Any:
@@ -70,8 +69,8 @@ def _hints(cls: type) -> dict[str, Any]:
 
 def _check_values(metadata: Any, value: Any, where: str) -> None:
     """Hold a field's value, or each item of a tuple, to the choices and the range of its `setting`."""
-    choices, low, high, unit = (metadata.get(name) for name in ("choices", "low", "high", "unit"))
-    unit = f" {unit}" if unit and unit != "1" else ""
+    choices, low, high = metadata.get("choices"), metadata.get("low", -math.inf), metadata.get("high", math.inf)
+    unit = f" {metadata['unit']}" if metadata.get("unit", "1") not in ("", "1") else ""
     for item in value if isinstance(value, tuple) else (value,):
         if isinstance(item, tuple):
             _check_values(metadata, item, where)
@@ -82,16 +81,8 @@ def _check_values(metadata: Any, value: Any, where: str) -> None:
             continue
         if isinstance(item, float) and not math.isfinite(item):
             raise ConfigError(f"{where} = {item}: must be a finite number")
-        if isinstance(item, int) and high is None and item > _LARGEST:
-            raise ConfigError(f"{where} = {item:.10g}{unit}: must be at most {_LARGEST:.10g}{unit}")
-        if (low is not None and item < low) or (high is not None and item > high):
-            raise ConfigError(f"{where} = {item:.10g}{unit}: must be {_range_text(low, high)}{unit}")
-
-
-def _range_text(low: float | None, high: float | None) -> str:
-    if low is not None and high is not None:
-        return f"between {low:.10g} and {high:.10g}"
-    return f"at least {low:.10g}" if low is not None else f"at most {high:.10g}"
+        if not low <= item <= high:
+            raise ConfigError(f"{where} = {item:.10g}{unit}: must be between {low:.10g} and {high:.10g}{unit}")
 
 
 @dataclasses.dataclass(frozen=True)

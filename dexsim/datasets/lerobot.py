@@ -94,12 +94,13 @@ def _write(folder: Path, hand: Hand, task: str, whole: dict[str, np.ndarray], ep
 
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True)
-    table = pyarrow.table({name: pyarrow.array(_rows(values), _type(values)) for name, values in whole.items()})
+    columns = {name: _column(values) for name, values in whole.items()}
+    table = pyarrow.table({name: column for name, (column, _) in columns.items()})
     parquet.write_table(table, folder / "data" / _FILE)
     parquet.write_table(pyarrow.Table.from_pylist(episodes), folder / "meta" / "episodes" / _FILE)
     pandas.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta" / "tasks.parquet")
     for name, content in {
-        "info": _info(hand, whole, len(episodes)),
+        "info": _info(hand, {name: feature for name, (_, feature) in columns.items()}, table.num_rows, len(episodes)),
         "stats": {name: _statistics(values) for name, values in whole.items()},
         "tactile": _tactile(hand),
     }.items():
@@ -125,7 +126,7 @@ def features_of(hand: Hand, trajectory: Trajectory) -> dict[str, np.ndarray]:
     }
 
 
-def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str, Any]:
+def _info(hand: Hand, features: dict[str, dict[str, Any]], frames: int, episodes: int) -> dict[str, Any]:
     joints, force = list(hand.joint_names), ["Fx", "Fy", "Fz"]
     names = {
         "observation.state": joints,
@@ -143,7 +144,7 @@ def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str
         "codebase_version": VERSION,
         "robot_type": hand.name,
         "total_episodes": episodes,
-        "total_frames": len(columns["index"]),
+        "total_frames": frames,
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
@@ -152,10 +153,7 @@ def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str
         "splits": {"train": f"0:{episodes}"},
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": None,
-        "features": {
-            name: {"dtype": dtype, "shape": shape, "names": names.get(name)}
-            for name, (dtype, shape) in {name: _format(values) for name, values in columns.items()}.items()
-        },
+        "features": {name: feature | {"names": names.get(name)} for name, feature in features.items()},
     }
 
 
@@ -217,24 +215,16 @@ def _pixels(picture: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(picture)))
 
 
-def _format(values: np.ndarray) -> tuple[str, list[int]]:
-    """Type and shape of a feature."""
-    if values.dtype == object:
-        return "image", list(_pixels(values[0]).shape)
-    return values.dtype.name, list(values.shape[1:]) or [1]
-
-
-def _rows(values: np.ndarray) -> list:
-    return [{"bytes": picture} for picture in values] if values.dtype == object else values.tolist()
-
-
-def _type(values: np.ndarray) -> Any:
-    """Nested lists of the array's own number type; a picture's file as Hugging Face's data sets have it."""
+def _column(values: np.ndarray) -> tuple[Any, dict[str, Any]]:
+    """A column of the table, and type and shape of the feature: nested lists of the array's own number type, or a
+    picture's file as Hugging Face's data sets have it."""
     import pyarrow
 
     if values.dtype == object:
-        return pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+        kind = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+        shape = list(_pixels(values[0]).shape)
+        return pyarrow.array([{"bytes": picture} for picture in values], kind), {"dtype": "image", "shape": shape}
     kind = pyarrow.from_numpy_dtype(values.dtype)
     for _ in values.shape[1:]:
         kind = pyarrow.list_(kind)
-    return kind
+    return pyarrow.array(values.tolist(), kind), {"dtype": values.dtype.name, "shape": list(values.shape[1:]) or [1]}

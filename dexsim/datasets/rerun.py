@@ -1,4 +1,4 @@
-"""Signals and taxels in the rerun viewer, or as its recording (extra `rerun`)."""
+"""Signals and taxels as a recording for the rerun viewer (extra `rerun`)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,8 +28,8 @@ def check_rerun() -> Any:
     return rerun
 
 
-def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path | None = None) -> None:
-    """Show signals at times [T] s, and taxels [T, F, N] N as pictures, in the viewer or in a recording at `path`.
+def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path) -> None:
+    """Write signals at times [T] s, and taxels [T, F, N] N as pictures, in a recording at `path`.
 
     Raises:
       DexsimError: rerun is not installed.
@@ -37,12 +37,9 @@ def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.nda
     """
     rerun = check_rerun()
     recording = rerun.RecordingStream("dexsim")
-    if path is None:
-        recording.spawn()
-    else:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Its error names the file; rerun's does not.
-        recording.save(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()  # Its error names the file; rerun's does not.
+    recording.save(path)
     for entity, (labels, values) in series.items():
         recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
         recording.send_columns(entity, [rerun.TimeColumn("run", duration=time)], rerun.Scalars.columns(scalars=values))

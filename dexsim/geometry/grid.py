@@ -39,14 +39,14 @@ class Grid:
     scale: jax.Array  # [] the object's size relative to the baked one
 
 
-def bake(mesh: meshes.Mesh, *, nodes: int = NODES) -> Grid:
+def bake(mesh: meshes.Trimesh, *, nodes: int = NODES) -> Grid:
     """The grid of a checked mesh (`mesh.load_mesh`), which is kept in the cache.
 
     Raises:
       AssetError: the mesh cannot be signed.
     """
     axes = [np.linspace(low - PAD, high + PAD, nodes) for low, high in mesh.bounds.T]
-    key = f"{mesh.fingerprint} {nodes} {PAD!r} {_VERSION}"
+    key = f"{meshes.fingerprint(mesh)} {nodes} {PAD!r} {_VERSION}"
     return from_distances(axes, cached_arrays("sdf", key, lambda: _measure(mesh, axes))["distance"])
 
 
@@ -141,7 +141,7 @@ def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     return np.where(smooth, total, 0.0).reshape(-1)
 
 
-def _measure(mesh: meshes.Mesh, axes: list[np.ndarray]) -> dict[str, np.ndarray]:
+def _measure(mesh: meshes.Trimesh, axes: list[np.ndarray]) -> dict[str, np.ndarray]:
     """Exact distance at the nodes, m."""
     meshes.check_sign(mesh)
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -1,20 +1,18 @@
 """Triangle meshes: checked at the door, and their exact signed distance in NumPy (for baking and for tests).
 
 The sign is that of the nearest triangle; where several share the nearest point, of the one whose plane is farthest away
-(Payne and Toga 1992), which is exact for a closed mesh that does not cut through itself. `check_sign` compares it with
-the winding number.
+(Payne and Toga 1992), which is exact for a closed mesh that does not cut through itself. `check_sign` compares volumes.
 
-Shapes: V vertices, T triangles, P points. Units: m, float64.
+A mesh is a `trimesh.Trimesh`, whose name is in its `metadata`. Shapes: V vertices, T triangles, P points. Units: m,
+float64.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import sys
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import label
@@ -24,6 +22,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from dexsim.core.errors import AssetError
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
@@ -36,46 +37,9 @@ _SAMPLES = 50_000  # points on a surface that stand for it
 _CLOSE = 0.25  # cells, distance of a shell from the surface that it closes
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Mesh:
-    """A closed surface with outward triangles. Make it with `load_mesh`, which checks it."""
-
-    name: str
-    vertices: np.ndarray  # [V, 3] m
-    faces: np.ndarray  # [T, 3]
-
-    @cached_property
-    def corners(self) -> np.ndarray:
-        """[T, 3, 3] m."""
-        return self.vertices[self.faces]
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """SHA-256 of the geometry."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.vertices, "<f8").tobytes())
-        digest.update(np.ascontiguousarray(self.faces, "<i8").tobytes())
-        return digest.hexdigest()
-
-    @cached_property
-    def normals(self) -> np.ndarray:
-        """Unit face normals [T, 3]; zero for a triangle without area."""
-        a, b, c = np.moveaxis(self.corners, 1, 0)
-        return _unit(np.cross(b - a, c - a))
-
-    @cached_property
-    def areas(self) -> np.ndarray:
-        """[T] m^2."""
-        a, b, c = np.moveaxis(self.corners, 1, 0)
-        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Lowest and highest corner [2, 3] m."""
-        return np.stack([self.vertices.min(0), self.vertices.max(0)])
-
-
-def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repair: str = "none") -> Mesh:
-    """Read a mesh file, or take a `trimesh.Trimesh` or a pair (vertices, faces), and check it.
+def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trimesh:
+    """Read a mesh file, or take a `trimesh.Trimesh` or a pair (vertices, faces), and check that it is closed, with
+    outward triangles.
 
     Corners at the same place, within 1.7e-7 of the mesh's size, become one: STL repeats them.
 
@@ -89,8 +53,7 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repai
       AssetError: not readable, not finite, of no graspable size, open, non-manifold, with inconsistent or inward
         normals, or flat.
     """
-    vertices, faces, given = _read(source)
-    name = name or given
+    vertices, faces, name = _read(source)
     if not np.all(np.isfinite(vertices)):
         raise AssetError(f"{name}: a vertex is not finite")
     vertices = vertices * scale
@@ -100,20 +63,34 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None, repai
             f"{name}: {size:.3g} m across at scale {scale:g}, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
             "metres, pass scale=0.001 for a file in millimetres (ObjectConfig.mesh_unit)"
         )
-    vertices, faces = _merge(vertices, faces, _SAME * size)
+    mesh = make_mesh(name, *_merge(vertices, faces, _SAME * size))
     try:
-        _check_closed(name, vertices, faces, size)
+        _check_closed(mesh, size)
     except AssetError as error:
         if repair == "none":
             raise
-        before = vertices, faces
-        vertices, faces = _merge(*(_shell if repair == "shell" else _hull)(*before), _SAME * size)
-        _check_closed(f"{name} after repair", vertices, faces, size)
-        print(f"{error}; its {repair} is {1e3 * _deviation(before, (vertices, faces)):.2g} mm away", file=sys.stderr)
-    return Mesh(name, vertices, faces)
+        closed = (_shell if repair == "shell" else _hull)(mesh)
+        mesh, given = make_mesh(f"{name} after repair", *_merge(*closed, _SAME * size)), mesh
+        _check_closed(mesh, size)
+        print(f"{error}; its {repair} is {1e3 * _deviation(given, mesh):.2g} mm away", file=sys.stderr)
+    return mesh
 
 
-def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Trimesh:
+    """A mesh of these arrays as they are, unchecked."""
+    import trimesh
+
+    return trimesh.Trimesh(vertices, faces, process=False, metadata={"name": name})
+
+
+def fingerprint(mesh: Trimesh) -> str:
+    """SHA-256 of the geometry."""
+    digest = hashlib.sha256(np.ascontiguousarray(mesh.vertices, "<f8").tobytes())
+    digest.update(np.ascontiguousarray(mesh.faces, "<i8").tobytes())
+    return digest.hexdigest()
+
+
+def signed_distance(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface a face's normal), at points."""
     points = np.asarray(points, np.float64).reshape(-1, 3)
     nearest, normal = find_nearest(mesh, points)
@@ -125,7 +102,7 @@ def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     return sign * gap, gradient
 
 
-def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest surface point [P, 3], and the normal [P, 3] of the triangle there that tells inside from outside.
 
     No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
@@ -133,7 +110,7 @@ def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """
     import trimesh
 
-    corners = mesh.corners
+    corners, normals = np.asarray(mesh.triangles), np.asarray(mesh.face_normals)
     reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
     middle = (corners.min(1) + corners.max(1)) / 2
     radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + _TIE
@@ -148,60 +125,36 @@ def find_nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
         least = np.full(len(some), np.inf)
         np.minimum.at(least, row, gap)
         tied = gap <= least[row] + _TIE
-        off_plane = np.where(tied, np.abs(np.sum(apart * mesh.normals[face], -1)), -1.0)
+        off_plane = np.where(tied, np.abs(np.sum(apart * normals[face], -1)), -1.0)
         order = np.lexsort((-off_plane, row))
         first = order[np.searchsorted(row[order], np.arange(len(some)))]
-        nearest[start : start + step], normal[start : start + step] = candidate[first], mesh.normals[face[first]]
+        nearest[start : start + step], normal[start : start + step] = candidate[first], normals[face[first]]
     return nearest, normal
 
 
-def winding_number(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """How often [P] the surface winds round each point [P, 3]: 1 inside, 0 outside (van Oosterom and Strackee 1983)."""
-    total = []
-    step = max(1, BLOCK // len(mesh.faces))
-    for start in range(0, len(points), step):
-        arm = mesh.corners[None] - points[start : start + step, None, None]  # [p, T, 3, 3]
-        length = np.linalg.norm(arm, axis=-1)
-        a, b, c = np.moveaxis(arm, 2, 0)
-        la, lb, lc = np.moveaxis(length, 2, 0)
-        top = np.sum(a * np.cross(b, c), -1)
-        bottom = la * lb * lc + np.sum(a * b, -1) * lc + np.sum(b * c, -1) * la + np.sum(c * a, -1) * lb
-        total.append(np.sum(2 * np.arctan2(top, bottom), 1) / (4 * np.pi))
-    return np.concatenate(total)
-
-
-def check_sign(mesh: Mesh, count: int = 400) -> None:
-    """Compare the sign of the distance with the winding number at random points, most of them inside.
+def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
+    """Compare the volume where the distance is negative with what the mesh encloses, by random points.
 
     Raises:
-      AssetError: the mesh cannot be signed, with the number of points that say so.
+      AssetError: they differ by more than a tenth and the error of sampling: the mesh cannot be signed.
     """
-    rng = np.random.default_rng(0)
     low, high = mesh.bounds
-    skin, normal, _ = sample_surface(mesh, count // 2, rng)
-    depth = rng.uniform(0, 0.1, (len(skin), 1)) * (high - low).max()
-    points = np.concatenate([rng.uniform(low, high, (count, 3)), skin - depth * normal])
-    winding = winding_number(mesh, points)
-    distance, _ = signed_distance(mesh, points)
-    clear = np.abs(distance) > 1e-6 * (high - low).max()
-    inside = np.abs(winding) > 0.5
-    if not np.any(inside & clear):
-        raise AssetError(f"{mesh.name}: cannot be signed: no interior point found in {len(points)}")
-    wrong = clear & ((inside != (distance < 0)) | (np.abs(winding - inside) > 0.1))
-    if np.any(wrong):
+    distance, _ = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
+    inside, enclosed = np.sum(distance < 0), count * mesh.volume / np.prod(high - low)
+    if abs(inside - enclosed) > 0.1 * enclosed + 4 * np.sqrt(enclosed):
         raise AssetError(
-            f"{mesh.name}: cannot be signed: inside and outside disagree at {wrong.sum()} of "
-            f"{len(points)} random points; the surface cuts through itself or a part is inside out"
+            f"{mesh.metadata['name']}: cannot be signed: {inside} of {count} random points are inside, expected "
+            f"{enclosed:.0f} by its volume; the surface cuts through itself or a part is inside out"
         )
 
 
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random points [count, 3] m, uniform by area, with their face normals [count, 3] and faces [count]."""
-    share = np.cumsum(mesh.areas)
+def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Random points [count, 3] m, uniform by area, with their face normals [count, 3]."""
+    share = np.cumsum(mesh.area_faces)
     face = np.searchsorted(share, rng.uniform(0, share[-1], count)).clip(0, len(share) - 1)
     u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
     weight = np.stack([1 - u, u * (1 - v), u * v], -1)
-    return np.einsum("pk,pkd->pd", weight, mesh.corners[face]), mesh.normals[face], face
+    return np.einsum("pk,pkd->pd", weight, mesh.triangles[face]), np.asarray(mesh.face_normals)[face]
 
 
 def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
@@ -233,41 +186,38 @@ def _merge(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[n
     return vertices[first], faces[keep]
 
 
-def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: float) -> None:
+def _check_closed(mesh: Trimesh, size: float) -> None:
     """Every edge joins two triangles that run along it in opposite directions, and the volume is positive."""
-    import trimesh
-
-    surface = trimesh.Trimesh(vertices, faces, process=False)
-    if not surface.is_watertight:
-        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-        count = np.unique(edges, axis=0, return_counts=True)[1]
+    name = mesh.metadata["name"]
+    if not mesh.is_watertight:
+        count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
         single, many = np.sum(count == 1), np.sum(count > 2)
         what = f"open: {single} edges have one triangle" if single else "non-manifold"
         more = f"{'; ' if single else ': '}{many} edges have more than two" if many else ""
         raise AssetError(f"{name}: the surface is {what}{more} (ObjectConfig.mesh_repair closes it: shell or hull)")
-    if not surface.is_winding_consistent:
+    if not mesh.is_winding_consistent:
         raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
-    volume = float(surface.volume)
+    volume = float(mesh.volume)
     if abs(volume) < 1e-6 * size**3:
         raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
     if volume < 0:
         raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
 
 
-def _hull(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _hull(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     # Nearly coplanar corners would leave slits between a hull's triangles.
-    grid = 1e-4 * np.ptp(vertices[faces.ravel()], axis=0).max()
-    corners = np.unique(np.round(vertices[faces.ravel()] / grid), axis=0) * grid
-    hull = trimesh.convex.convex_hull(corners)
+    used = mesh.vertices[mesh.faces.ravel()]
+    grid = 1e-4 * np.ptp(used, axis=0).max()
+    hull = trimesh.convex.convex_hull(np.unique(np.round(used / grid), axis=0) * grid)
     return np.asarray(hull.vertices), np.asarray(hull.faces)
 
 
-def _shell(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shell(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     """A closed surface round another one: all that cannot be reached from outside through gaps of less than two cells
     is inside. It is the boundary of cells, pulled to the surface."""
-    points = _points_on(vertices, faces)
+    points = _points_on(mesh)
     cell = np.ptp(points, axis=0).max() / _CELLS
     low = points.min(0) - 3 * cell
     count = np.ceil((points.max(0) + 3 * cell - low) / cell).astype(int)
@@ -312,18 +262,13 @@ def _boundary(solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(np.unravel_index(used, shape), -1), np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
 
 
-def _points_on(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _points_on(mesh: Trimesh) -> np.ndarray:
     """Random points on a surface, and its corners."""
-    points, _, _ = sample_surface(Mesh("", vertices, faces), _SAMPLES, np.random.default_rng(0))
-    return np.concatenate([points, vertices])
+    points, _ = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
+    return np.concatenate([points, mesh.vertices])
 
 
-def _deviation(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+def _deviation(one: Trimesh, other: Trimesh) -> float:
     """The largest distance m of a point of either surface from the other one, between samples."""
-    a, b = _points_on(*one), _points_on(*other)
+    a, b = _points_on(one), _points_on(other)
     return float(max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max()))
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return vector / np.where(length > 0, length, 1.0)

@@ -5,12 +5,8 @@ Distances are negative inside, and exact but for points inside an overlap of sev
 depth below the nearest of their surfaces, not below the outer one.
 """
 
-from collections.abc import Iterable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dexsim.core.pytree import Array, pytree_dataclass, static
 
@@ -80,20 +76,6 @@ def to_local(points: Array, position: Array, rotation: Array) -> jax.Array:
     kernel of transform and distance."""
     arm = [p - position[axis] for axis, p in enumerate(_split(points))]
     return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3)) for axis in range(3)], -1)
-
-
-def of_geoms(geoms: Iterable[Any]) -> Shape | None:
-    """The union of a link's primitives (`hand.Geom`), in its frame; None if none is of a kind in `KINDS`."""
-    parts = [g for g in geoms if g.kind in KINDS]
-    if not parts:
-        return None
-    return Shape(
-        kinds=tuple(g.kind for g in parts),
-        size=np.stack([g.size for g in parts]),
-        position=np.stack([g.position for g in parts]),
-        rotation=np.stack([g.rotation for g in parts]),
-        active=np.ones(len(parts), bool),
-    )
 
 
 def distance_and_normal(points: Array, shape: Shape) -> tuple[jax.Array, jax.Array]:

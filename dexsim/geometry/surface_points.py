@@ -9,12 +9,13 @@ Shapes: N points. Units: m.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import Array, pytree_dataclass
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import sdf
 
@@ -22,6 +23,7 @@ COUNT = 1024
 """Points of a mesh, or of each primitive of a union."""
 _BLOCK = 64  # points compared at a time
 _OUT_OF_THE_WAY = 10.0  # m, where a point that does not count is put
+_SKIN = 0.1  # depth of the random points in a primitive of size 1 that are moved to its surface
 
 
 @pytree_dataclass
@@ -32,9 +34,9 @@ class SurfacePoints:
     normal: jax.Array  # [N, 3] unit, outward
 
 
-def from_mesh(mesh: meshes.Mesh, count: int = COUNT) -> SurfacePoints:
+def from_mesh(mesh: meshes.Trimesh, count: int = COUNT) -> SurfacePoints:
     """Evenly spread points of a mesh: of random ones, those farthest from each other, with their faces' normals."""
-    position, normal, _ = meshes.sample_surface(mesh, 12 * count, np.random.default_rng(0))
+    position, normal = meshes.sample_surface(mesh, 12 * count, np.random.default_rng(0))
     keep = _spread(position, count)
     return SurfacePoints(jnp.asarray(position[keep], jnp.float32), jnp.asarray(normal[keep], jnp.float32))
 
@@ -46,7 +48,8 @@ def from_shape(shape: sdf.Shape, count: int = COUNT) -> SurfacePoints:
     """
     position, normal = [], []
     for k, kind in enumerate(shape.kinds):
-        local, out = _TEMPLATES[kind](count, shape.size[k])
+        unit, out = _template(kind, count)
+        local = sum(shape.size[k][axis] * unit[axis] for axis in range(3))
         turn = shape.rotation[k]
         place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k][None]
         buried = jnp.zeros(count, bool)
@@ -114,61 +117,21 @@ def _spread(position: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def _fibonacci(count: int) -> np.ndarray:
-    """Directions [count, 3] spread evenly over the sphere."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1).astype(np.float32)
-
-
-def _sphere_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
-    out = jnp.asarray(_fibonacci(count))
-    return size[0] * out, out
-
-
-def _capsule_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
-    """Even along the axis with the share of area on tube and caps (both have 2 pi r per unit of height)."""
-    radius, half = size[0], size[1]
-    height = (half + radius) * jnp.asarray(_fibonacci(count)[:, 2])
-    over = jnp.sign(height) * jnp.maximum(jnp.abs(height) - half, 0.0)
-    sine = over / radius
-    turn = jnp.asarray(np.arange(count) * np.pi * (3 - np.sqrt(5)), jnp.float32)
-    cosine = jnp.sqrt(jnp.maximum(1 - sine**2, 0.0))
-    out = jnp.stack([cosine * jnp.cos(turn), cosine * jnp.sin(turn), sine], -1)
-    return radius * out + jnp.stack([0 * turn, 0 * turn, height - over], -1), out
-
-
-def _cylinder_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
-    """Half of them on the side, a quarter on each end (sunflower pattern)."""
-    side, end = count - 2 * (count // 4), count // 4
-    golden = np.pi * (3 - np.sqrt(5))
-    turn = jnp.asarray(np.arange(side) * golden, jnp.float32)
-    rise = jnp.asarray((2 * np.arange(side) + 1) / side - 1, jnp.float32)
-    round_ = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0 * turn], -1)
-    angle = np.arange(end) * golden
-    disc = np.sqrt((np.arange(end) + 0.5) / end)[:, None] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    disc, up = jnp.asarray(disc, jnp.float32), jnp.array([[0.0, 0.0, 1.0]])
-    side_points = size[0] * round_ + (size[1] * rise)[:, None] * up
-    position = jnp.concatenate([side_points, size[0] * disc + size[1] * up, size[0] * disc - size[1] * up])
-    return position, jnp.concatenate([round_, jnp.tile(up, (end, 1)), jnp.tile(-up, (end, 1))])
-
-
-def _box_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
-    """A sixth on each face, in a low-discrepancy pattern (Roberts 2018) in units of the half-extents."""
-    face = np.arange(count) % 6
-    order = np.arange(count) // 6
-    flat = 2 * np.stack([(0.5 + 0.7548776662 * order) % 1, (0.5 + 0.5698402910 * order) % 1], -1) - 1
-    axis, side = face // 2, 2.0 * (face % 2) - 1
-    unit, out = np.zeros((count, 3)), np.zeros((count, 3))
-    rows = np.arange(count)
-    unit[rows, axis] = out[rows, axis] = side
-    unit[rows, (axis + 1) % 3], unit[rows, (axis + 2) % 3] = flat[:, 0], flat[:, 1]
-    return jnp.asarray(unit, jnp.float32) * size[None], jnp.asarray(out, jnp.float32)
-
-
-_TEMPLATES = {
-    "sphere": _sphere_points,
-    "box": _box_points,
-    "capsule": _capsule_points,
-    "cylinder": _cylinder_points,
-}
+@functools.cache
+def _template(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly on a primitive whose sizes are 1: what each of its sizes adds to them [3, count, 3], and
+    their normals [count, 3], which are the same at all sizes."""
+    rng, one = np.random.default_rng(0), np.ones((1, 3), np.float32)
+    shape = sdf.Shape((kind,), one, 0 * one, np.eye(3, dtype=np.float32)[None], np.ones(1, bool))
+    with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
+        points = rng.uniform(-1, 1, (60 * count, 3)).astype(np.float32) * [1, 1, 2 if kind == "capsule" else 1]
+        distance, normal = (np.asarray(x) for x in sdf.distance_and_normal(points, shape))
+        below = np.flatnonzero((distance > -_SKIN) & (distance < 0))
+    points, normal = (points - distance[:, None] * normal)[below], normal[below]
+    keep = _spread(points, count)
+    points, normal = points[keep].astype(np.float32), normal[keep]
+    if kind == "box":
+        return np.eye(3, dtype=np.float32)[:, None] * points, normal
+    height = points[:, 2] * (kind == "cylinder") + np.clip(points[:, 2], -1, 1) * (kind == "capsule")
+    axial = height[:, None] * np.array([0, 0, 1], np.float32)
+    return np.stack([points - axial, axial, 0 * axial]), normal

@@ -10,17 +10,16 @@ _SAMPLES = 600
 _CELL = 5e-3  # m, of the grid on which a palm's face is measured
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@dataclasses.dataclass(eq=False, kw_only=True)
 class Capsule:
-    """A segment [2, 3] m and a radius m, with how far the link's convex hull is from its surface, m."""
+    """A segment [2, 3] m and a radius m; `error`: how far the link's convex hull is from it, mean and largest, m."""
 
     ends: np.ndarray
     radius: float
-    mean_error: float
-    largest_error: float
+    error: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@dataclasses.dataclass(eq=False, kw_only=True)
 class PalmBox:
     """A box along the palm's axes: its middle and half-extents [3] m. Its face is at the largest x."""
 
@@ -47,9 +46,7 @@ def fit_capsule(surface: Any, along: np.ndarray) -> Capsule:
     ends = best[:6].reshape(2, 3)
     if (ends[1] - ends[0]) @ along < 0:
         ends = ends[::-1]
-    return Capsule(
-        ends=ends, radius=float(abs(best[6])), mean_error=float(away.mean()), largest_error=float(away.max())
-    )
+    return Capsule(ends=ends, radius=float(abs(best[6])), error=(float(away.mean()), float(away.max())))
 
 
 def fit_palm(surface: Any) -> PalmBox:

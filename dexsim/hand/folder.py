@@ -4,7 +4,6 @@ Every body is drawn along the palm frame, with its origin on its hinge. So posit
 palm frame, and no body has a rotation of its own.
 """
 
-import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,144 +12,142 @@ import mujoco
 import numpy as np
 
 from dexsim.core.files import write_atomic
-from dexsim.hand.fit import Capsule, PalmBox
-from dexsim.hand.vendor import Link
+from dexsim.hand.anatomy import flexion_links, tip_of
+from dexsim.hand.vendor import Draft, Link
 
-_TOUCH, _SHELL, _PAD = (0.30, 0.32, 0.36, 1.0), (0.25, 0.27, 0.30, 1.0), (0.85, 0.85, 0.87, 1.0)  # colours
+_TOUCH, _PAD = (0.30, 0.32, 0.36, 1.0), (0.85, 0.85, 0.87, 1.0)  # colours
 _NOMINAL_TORQUE = 1.1  # Nm, stall torque of the motors that the nominal gains are for
 _COUPLING = {"solref": [0.012, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # stiff
+_GRID = (6, 8)  # columns and rows of taxels, over the front two thirds of a pad and along it
+_PITCH = 0.0035  # m, at most
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class FingerSheet:
-    """What a hand's TOML says of a finger."""
-
-    name: str
-    tip_link: int
-    root_joint: str
-    facing: np.ndarray  # [3] palm frame, of the pad in the drawing
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class HandSheet:
-    """All that a hand's folder holds, in the palm frame with every hinge at 0. Links are as in `Description`: the palm
-    first, with limits known; `capsules` are those of the links by their index, a fingertip's is its pad."""
-
-    name: str
-    side: str  # right or left
-    links: tuple[Link, ...]
-    palm: PalmBox
-    capsules: dict[int, Capsule]
-    fingers: tuple[FingerSheet, ...]  # thumb first
-    motors: tuple[str, ...]  # joints in the TOML's order
-    taxel_grid: tuple[int, int]
-    taxel_pitch: tuple[float, float]
-    remarks: tuple[str, ...]  # lines of a comment: sources, assumptions, signs
-    # Of the first grasp.
-    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
-    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
-    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
-
-
-def write_hand(sheet: HandSheet, folder: Path) -> Path:
-    """Write NAME.xml and NAME.toml into the folder. Returns the TOML's path.
+def write_hand(draft: Draft, name: str, remarks: Iterable[str], folder: Path) -> Path:
+    """Write NAME.xml and NAME.toml into the folder, with remarks as their first lines. Returns the TOML's path.
 
     Raises:
       OSError: a file cannot be written.
     """
-    remarks = "".join(f"  {line}\n" for line in sheet.remarks)
-    model = _mjcf(sheet).to_xml().replace(">\n", f">\n  <!--\n{remarks.replace('--', '- -')}  -->\n", 1)
-    write_atomic(folder / f"{sheet.name}.xml", [model.encode()])
-    path = folder / f"{sheet.name}.toml"
-    write_atomic(path, [_toml(sheet).encode()])
+    remarks = tuple(remarks)
+    comment = "".join(f"  {line}\n" for line in remarks).replace("--", "- -")
+    model = _mjcf(draft, name).to_xml().replace(">\n", f">\n  <!--\n{comment}  -->\n", 1)
+    write_atomic(folder / f"{name}.xml", [model.encode()])
+    path = folder / f"{name}.toml"
+    text = "\n".join([*(f"# {line}" for line in remarks), *_toml(draft, name)])
+    write_atomic(path, [f"{text}\n".encode()])
     return path
 
 
-def _mjcf(sheet: HandSheet) -> mujoco.MjSpec:
-    spec, kinds = mujoco.MjSpec(), mujoco.mjtGeom
-    spec.modelname = sheet.name
+def root_joint(draft: Draft, chain: list[int]) -> str:
+    """The motor whose torque represents a finger: its first one that flexes, or else its first; empty for none."""
+    order = (*flexion_links(draft.links, chain), *chain)
+    return next((draft.links[at].joint for at in order if draft.links[at].is_motor), "")
+
+
+def _mjcf(draft: Draft, name: str) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = name
     spec.compiler.degree = False
+    tips = {chain[-1]: finger for finger, chain in draft.fingers.items()}
     bodies: list[Any] = []
-    tips = {finger.tip_link: finger.name for finger in sheet.fingers}
-    for at, link in enumerate(sheet.links):
-        joint = link.joint
-        origin = np.zeros(3) if joint is None else joint.anchor
-        above = spec.worldbody if at == 0 else bodies[link.parent]
-        parent = sheet.links[link.parent].joint if at else None
-        body = above.add_body(name=link.name, pos=origin - (parent.anchor if parent else 0.0))
-        body.explicitinertial, body.mass, body.ipos = True, link.mass, link.centre - origin
-        inertia = link.inertia
-        body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        if joint is not None:
-            hinge = body.add_joint(
-                name=joint.name, axis=joint.axis, range=[joint.low, joint.high], damping=0.005 if joint.leader else 0.02
-            )
-            hinge.limited, hinge.armature = mujoco.mjtLimited.mjLIMITED_TRUE, 0.0002 if joint.leader else 0.001
-            if joint.leader:
-                data = np.zeros(mujoco.mjNEQDATA)
-                data[:2] = joint.offset, joint.ratio
-                spec.add_equality(
-                    type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.name,
-                    name2=joint.leader, data=data, **_COUPLING,
-                )  # fmt: skip
-            else:
-                hinge.actfrclimited, hinge.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-joint.torque, joint.torque]
-        if at == 0:
-            centre, half = sheet.palm.centre, sheet.palm.half
-            body.add_geom(name="palm_box", type=kinds.mjGEOM_BOX, pos=centre, size=half, rgba=_TOUCH, group=3)
-            # The palm's face as a half-space, for objects that boxes do not meet in closed form.
-            body.add_geom(
-                name="palm_face", type=kinds.mjGEOM_PLANE, pos=centre + [half[0], 0, 0],
-                quat=[0.5**0.5, 0, 0.5**0.5, 0], size=[half[2], half[1], 0.001], rgba=[0, 0, 0, 0], group=3,
-            )  # fmt: skip
-        elif at in sheet.capsules:
-            capsule = sheet.capsules[at]
-            middle, span = capsule.ends.mean(0) - origin, capsule.ends[1] - capsule.ends[0]
-            quat = np.zeros(4)
-            mujoco.mju_quatZ2Vec(quat, span)
-            tip = tips.get(at)
-            body.add_geom(
-                name=f"{tip}_pad" if tip else f"{link.name}_capsule", type=kinds.mjGEOM_CAPSULE, pos=middle, quat=quat,
-                size=[capsule.radius, max(np.linalg.norm(span) / 2, 1e-4), 0], rgba=_PAD if tip else _TOUCH, group=3,
-            )  # fmt: skip
-            if tip:
-                end = capsule.ends[1] + capsule.radius * span / np.linalg.norm(span)
-                body.add_site(name=f"{tip}_tip", pos=end - origin, size=[0.002, 0, 0], group=4)
+    for at, link in enumerate(draft.links):
+        above = draft.links[link.parent].anchor if at else np.zeros(3)
+        body = (bodies[link.parent] if at else spec.worldbody).add_body(name=link.name, pos=link.anchor - above)
+        body.explicitinertial, body.mass, body.ipos = True, link.mass, link.centre - link.anchor
+        body.fullinertia = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         bodies.append(body)
-    for finger in sheet.fingers[1:]:
-        spec.add_pair(geomname1=f"{sheet.fingers[0].name}_pad", geomname2=f"{finger.name}_pad", condim=1)
+        if at:
+            _add_hinge(spec, body, link)
+            _add_capsule(body, link, tips.get(at, ""))
+        else:
+            _add_palm(body, draft)
+    thumb, *fingers = draft.fingers
+    for finger in fingers:
+        spec.add_pair(geomname1=f"{thumb}_pad", geomname2=f"{finger}_pad", condim=1)
     return spec
 
 
-def _toml(sheet: HandSheet) -> str:
-    joints = {link.joint.name: link.joint for link in sheet.links if link.joint}
-    speeds, angles = ([f(name) for name in sheet.motors] for f in (lambda n: joints[n].speed, sheet.posture.get))
+def _add_hinge(spec: mujoco.MjSpec, body: Any, link: Link) -> None:
+    follows = bool(link.leader)
+    hinge = body.add_joint(
+        name=link.joint, axis=link.axis, range=[link.low, link.high], damping=0.005 if follows else 0.02
+    )
+    hinge.limited, hinge.armature = mujoco.mjtLimited.mjLIMITED_TRUE, 0.0002 if follows else 0.001
+    if not follows:
+        hinge.actfrclimited, hinge.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-link.torque, link.torque]
+        return
+    data = np.zeros(mujoco.mjNEQDATA)
+    data[:2] = link.offset, link.ratio
+    names = {"name1": link.joint, "name2": link.leader}
+    of_joints = {"type": mujoco.mjtEq.mjEQ_JOINT, "objtype": mujoco.mjtObj.mjOBJ_JOINT}
+    spec.add_equality(**of_joints, **names, data=data, **_COUPLING)
+
+
+def _add_palm(body: Any, draft: Draft) -> None:
+    """The palm's box, and its face as a half-space for objects that boxes do not meet in closed form."""
+    assert draft.palm is not None, "fitted before"
+    kinds, centre, half = mujoco.mjtGeom, draft.palm.centre, draft.palm.half
+    body.add_geom(name="palm_box", type=kinds.mjGEOM_BOX, pos=centre, size=half, rgba=_TOUCH, group=3)
+    face, quat = centre + [half[0], 0, 0], [0.5**0.5, 0, 0.5**0.5, 0]
+    size = [half[2], half[1], 0.001]
+    body.add_geom(name="palm_face", type=kinds.mjGEOM_PLANE, pos=face, quat=quat, size=size, rgba=[0] * 4, group=3)
+
+
+def _add_capsule(body: Any, link: Link, tip: str) -> None:
+    """A link's capsule; of a fingertip it is the pad, with a site at its end."""
+    if link.capsule is None:
+        return
+    ends, radius = link.capsule.ends, link.capsule.radius
+    span, quat = ends[1] - ends[0], np.zeros(4)
+    length = np.linalg.norm(span)
+    mujoco.mju_quatZ2Vec(quat, span)
+    body.add_geom(
+        name=f"{tip}_pad" if tip else f"{link.name}_capsule",
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        pos=ends.mean(0) - link.anchor,
+        quat=quat,
+        size=[radius, max(length / 2, 1e-4), 0],
+        rgba=_PAD if tip else _TOUCH,
+        group=3,
+    )
+    if tip:
+        end = ends[1] + radius * span / length
+        body.add_site(name=f"{tip}_tip", pos=end - link.anchor, size=[0.002, 0, 0], group=4)
+
+
+def _toml(draft: Draft, name: str) -> list[str]:
+    links, motors = draft.links, draft.motors
+    pads = [capsule for chain in draft.fingers.values() if (capsule := links[chain[-1]].capsule)]
+    across = min(_PITCH, min(pad.radius for pad in pads) * np.pi * 2 / 3 / (_GRID[0] - 1))
+    lengths = [float(np.linalg.norm(pad.ends[1] - pad.ends[0])) + pad.radius for pad in pads]
+    along = min(_PITCH, min(lengths) / (_GRID[1] - 1))
     lines = [
-        *(f"# {line}" for line in sheet.remarks),
-        f'name = "{sheet.name}"',
-        f'side = "{sheet.side}"',
-        f'model = "{sheet.name}.xml"',
-        f'palm = "{sheet.links[0].name}"',
-        "joints = [" + ", ".join(f'"{name}"' for name in sheet.motors) + "]",
-        f"speed_limits = {_row(speeds)}",
-        f"gains = {_row(min(joints[name].torque / _NOMINAL_TORQUE, 1.0) for name in sheet.motors)}",
-        f"taxel_grid = {list(sheet.taxel_grid)}",
-        f"taxel_pitch = {_row(sheet.taxel_pitch)}",
+        f'name = "{name}"',
+        f'side = "{draft.side}"',
+        f'model = "{name}.xml"',
+        f'palm = "{links[0].name}"',
+        "joints = [" + ", ".join(f'"{motor.joint}"' for motor in motors) + "]",
+        f"speed_limits = {_row(motor.speed for motor in motors)}",
+        f"gains = {_row(min(motor.torque / _NOMINAL_TORQUE, 1.0) for motor in motors)}",
+        f"taxel_grid = {list(_GRID)}",
+        f"taxel_pitch = {_row((across, along))}",
         "\n[grasp]",
-        f"posture = {_row(angles)}",
-        f"centre = {_row(sheet.centre)}",
-        f"finger_force = {_row(sheet.finger_force)}",
+        f"posture = {_row(draft.posture[motor.joint] for motor in motors)}",
+        f"centre = {_row(draft.centre)}",
+        f"finger_force = {_row(draft.finger_force)}",
     ]
-    for finger in sheet.fingers:
+    for finger, chain in draft.fingers.items():
+        last = links[chain[-1]]
+        facing = np.cross(last.axis, tip_of(links, chain) - last.anchor)
         lines += [
             "\n[[fingers]]",
-            f'name = "{finger.name}"',
-            f'tip = "{finger.name}_tip"',
-            f'root_joint = "{finger.root_joint}"',
-            f'pad = "{finger.name}_pad"',
-            f"facing = {_row(finger.facing)}",
+            f'name = "{finger}"',
+            f'tip = "{finger}_tip"',
+            f'root_joint = "{root_joint(draft, chain)}"',
+            f'pad = "{finger}_pad"',
+            f"facing = {_row(facing / np.linalg.norm(facing))}",
         ]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _row(values: Iterable[Any]) -> str:

@@ -1,19 +1,23 @@
 """The hand, read from an MJCF, a taxel layout and a short TOML: nothing in the library but the files under
 `assets/hand/` knows which hand it is."""
 
+import contextlib
 import dataclasses
+import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dexsim.core.config import Config, Range, from_dict, setting
+from dexsim.core.assets import asset_path
+from dexsim.core.config import Config, Range, from_dict, naming_file, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
 from dexsim.hand.description import SHAPES, Geom, Hand
-from dexsim.hand.files import digest_of, find_hand, shipped_name
-from dexsim.hand.layout import MOST, lattice, on_surface, placed, read_taxels
+from dexsim.hand.layout import MOST, lay_taxels, read_taxels
 
+DEFAULT = "xhand_right"
 _SLACK = 1e-3  # rad, how far a posture or a follower may be beyond a joint's range
 
 
@@ -82,44 +86,92 @@ class HandFile(Config):
     fingers: tuple[FingerEntry, ...]
 
 
+def find_hand(name: str | Path | None) -> Path:
+    """The TOML of a hand that is named by a path, or by the name of a shipped one; None for the default one."""
+    if not name:
+        return asset_path(f"hand/{DEFAULT}.toml")
+    text = str(name)
+    if re.fullmatch(r"\w+", text) and not Path(text).is_file():  # a folder of that name is no hand
+        for place in (f"hand/{text}.toml", f"hand/{text}/{text}.toml"):
+            with contextlib.suppress(AssetError):
+                return asset_path(place)
+        what = "a folder" if Path(text).is_dir() else "no such file"
+        raise AssetError(f"hand {text!r}: {what}, and no shipped hand has that name")
+    return Path(text)
+
+
+def shipped_name(path: Path) -> str:
+    """The name of the shipped hand whose TOML this is; empty for others."""
+    with contextlib.suppress(AssetError):
+        return path.stem if path.resolve() == find_hand(path.stem).resolve() else ""
+    return ""
+
+
+def digest_of(*files: Path) -> str:
+    """A hash of the content of a hand's files."""
+    digest = hashlib.sha256()
+    for path in files:
+        data = path.read_bytes()
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return digest.hexdigest()
+
+
 def load_hand(path: str | Path | None = None) -> Hand:
     """Read a hand from its TOML, or a shipped one by its name; the XHand when `path` is None.
 
     Raises:
       AssetError: a file is missing or broken, or the three do not fit together.
     """
-    given, path = path, find_hand(path)
-    table = _read_table(path)
-    model_path = path.parent / table.model
-    model = _load_model(path, model_path)
-    joints, followers = _find_joints(path, model_path, model, table)
-    _check_posture(path, model, joints, table, "grasp")
-    _check_posture(path, model, joints, table, "rotate")
-    palm = _find(path, model_path, model, "body", table.palm)
+    file = find_hand(path)
+    try:
+        return _load(file, shipped_name(file) or str(path))
+    except FileNotFoundError as error:
+        raise AssetError(f"{error.filename}: no such file") from None
+    except KeyError as error:  # of MuJoCo: a name that the model lacks, and those that it has
+        raise AssetError(f"{file}: {error.args[0]}") from None
+    except (OSError, ValueError, ConfigError) as error:
+        raise AssetError(f"{file}: {' '.join(str(error).split())}") from None
+
+
+def _load(path: Path, source: str) -> Hand:
+    import mujoco  # late: who imports this module for its types alone needs none
+
+    table = from_dict(HandFile, read_toml(path))
+    names = [finger.name for finger in table.fingers]
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(f"[[fingers]] are named {names}: expected one or more, each with a name of its own")
+    if (table.taxel_pitch is None) != bool(table.taxels):
+        raise ConfigError("give either taxels (a file) or taxel_pitch (a lattice on each finger's pad)")
+    files = [path, path.parent / table.model]
+    if b"<include" in files[1].read_bytes():  # what changes there would go unnoticed
+        raise ConfigError(f"{table.model}: <include> is not supported: paste the file in its place")
+    model = mujoco.MjModel.from_xml_path(str(files[1]))
+    joints = [model.joint(name).id for name in table.joints]
+    followers = _read_followers(model, joints)
+    _check_joints(model, table, joints, len(followers))
+    palm = model.body(table.palm).id
     bodies = [b for b in range(1, model.nbody) if is_below(model.body_parentid, b, palm)]
     if unnamed := [b for b in bodies if not model.body(b).name]:
         parent = model.body(model.body_parentid[unnamed[0]]).name
-        raise AssetError(f"{model_path}: a body of {parent!r} has no name: every link from the palm on needs one")
+        raise ConfigError(f"{table.model}: a body of {parent!r} has no name: every link from the palm on needs one")
     row = {body: i for i, body in enumerate(bodies)}
-    at = _hinges_of_bodies(model_path, model, palm, row)
+    at = _hinges_of_bodies(model, palm, row)
     has = at >= 0
     moved = {joint: (joint, 1.0, 0.0) for joint in joints} | followers | {-1: (-1, 1.0, 0.0)}
     body_motor, body_ratio, body_offset = zip(*(moved[hinge] for hinge in at), strict=True)
-    tips = _find_tips(path, model_path, model, table, row)
+    tips = _find_tips(model, table, row)
     tip_body = np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32)
-    geoms = _read_geoms(model_path, model, row)
-    files: tuple[Path, ...] = (path, model_path)
-    finger_names = tuple(finger.name for finger in table.fingers)
+    geoms = _read_geoms(model, row)
     if table.taxels:
-        files = (*files, path.parent / table.taxels)
-        taxels = read_taxels(files[-1], finger_names, table.taxel_grid)
+        files.append(path.parent / table.taxels)
+        taxels = read_taxels(files[-1], tuple(names), table.taxel_grid)
     else:
-        taxels = _lay_taxels(path, table, geoms, tip_body)
+        taxels = _lay_taxels(table, geoms, tip_body)
     identity = np.eye(3)
 
     return Hand(
         name=table.name or path.stem,
-        model_path=model_path,
+        model_path=files[1],
         palm=table.palm,
         joint_names=table.joints,
         joint_lower=_f32(model.jnt_range[joints, 0]),
@@ -137,7 +189,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
-        finger_names=finger_names,
+        finger_names=tuple(names),
         tip_body=tip_body,
         tip_offset=_f32(model.site_pos[tips]),
         root_joint=np.array([table.joints.index(finger.root_joint) for finger in table.fingers], np.int32),
@@ -153,81 +205,18 @@ def load_hand(path: str | Path | None = None) -> Hand:
         rotate_posture=table.rotate.posture,
         rotate_reference=table.rotate.reference or (),
         side=table.side,
-        source=shipped_name(path) or str(given),
+        source=source,
         digest=digest_of(*files),
     )
 
 
-def _read_table(path: Path) -> HandFile:
-    try:
-        table = from_dict(HandFile, read_toml(path))
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, ValueError, ConfigError) as error:
-        raise AssetError(f"{path}: {error}") from None
-    if (table.taxel_pitch is None) != bool(table.taxels):
-        raise AssetError(f"{path}: give either taxels (a file) or taxel_pitch (a lattice on each finger's pad)")
-    names = [finger.name for finger in table.fingers]
-    if not names or len(set(names)) < len(names):
-        raise AssetError(f"{path}: [[fingers]] are named {names}: expected one or more, each with a name of its own")
-    return table
-
-
-def _load_model(path: Path, model_path: Path) -> Any:
-    import mujoco
-
-    if not model_path.is_file():
-        raise AssetError(f"{model_path}: no such file (model of {path})")
-    try:
-        return mujoco.MjModel.from_xml_path(str(model_path))
-    except ValueError as error:
-        raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
-
-
-def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int:
-    """Index of a joint, body or site."""
-    import mujoco
-
-    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-    if index < 0:
-        raise AssetError(f"{path}: {model_path.name} has no {kind} {name!r}")
-    return index
-
-
-def _find_joints(
-    path: Path, model_path: Path, model: Any, table: HandFile
-) -> tuple[list[int], dict[int, tuple[int, float, float]]]:
-    """The model's joints in the order of the TOML, and those that follow them."""
-    import mujoco
-
-    joints = [_find(path, model_path, model, "joint", name) for name in table.joints]
-    followers = _read_followers(model_path, model, joints)
-    motors = model.njnt - len(followers)
-    hinges = np.all(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
-    if len(joints) != motors or len(set(joints)) != motors or not hinges:
-        raise AssetError(
-            f"{path}: joints lists {len(set(joints))} of the {motors} joints of {model_path.name}; every joint must be "
-            "a hinge, and be listed once or follow one by an equality"
-        )
-    for name, values in (("speed_limits", table.speed_limits), ("gains", table.gains or joints)):
-        if len(values) != len(joints):
-            raise AssetError(f"{path}: {len(values)} {name} for {len(joints)} joints")
-    for name, joint, (low, high) in zip(table.joints, joints, model.jnt_actfrcrange[joints], strict=True):
-        if not model.jnt_limited[joint] or high <= 0 or not np.isclose(low, -high):
-            raise AssetError(
-                f"{model_path}: joint {name!r} needs a range, and an actuatorfrcrange from -T to T, its stall torque; "
-                f"got {low:g} to {high:g} Nm"
-            )
-    return joints, followers
-
-
-def read_coupling(path: Path, model: Any, index: int) -> tuple[int, int, float, float] | None:
+def read_coupling(model: Any, index: int) -> tuple[int, int, float, float] | None:
     """An equality of two joints: the one that follows, its leader, the ratio and the offset [rad]; None of others.
 
     MuJoCo's polynomial is q1 - ref1 = a0 + a1 (q2 - ref2) + ...
 
     Raises:
-      AssetError: it has higher powers.
+      ConfigError: it has higher powers.
     """
     import mujoco
 
@@ -236,118 +225,137 @@ def read_coupling(path: Path, model: Any, index: int) -> tuple[int, int, float, 
         return None
     a0, ratio, *higher = model.eq_data[index, :5]
     if any(higher) or not ratio:
-        raise AssetError(
-            f"{path}: joint {model.joint(first).name!r} follows {model.joint(second).name!r} by the polycoef "
+        raise ConfigError(
+            f"joint {model.joint(first).name!r} follows {model.joint(second).name!r} by the polycoef "
             f"{model.eq_data[index, :5].tolist()}; only an offset and a ratio are supported: a0 a1 0 0 0"
         )
     reference = model.qpos0[model.jnt_qposadr[[first, second]]]
     return first, second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
 
 
-def _read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple[int, float, float]]:
+def _read_followers(model: Any, motors: list[int]) -> dict[int, tuple[int, float, float]]:
     """Hinges that follow a motor (one motor, two joints): for each its motor's joint, the ratio and the offset [rad].
 
     The MJCF says so by an `<equality>` of joints, which the physics honours too.
     """
     if model.ntendon:
-        raise AssetError(f"{path}: tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
+        raise ConfigError(f"tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
     followers: dict[int, tuple[int, float, float]] = {}
     for index in range(model.neq):
-        what = f"{path}: equality {model.equality(index).name or f'#{index}'!r}"
-        coupling = read_coupling(path, model, index)
+        coupling = read_coupling(model, index)
         if coupling is None:
-            raise AssetError(f"{what}: only active ones of two joints are supported")
+            name = model.equality(index).name or f"#{index}"
+            raise ConfigError(f"equality {name!r}: only active ones of two joints are supported")
         first, second, ratio, offset = coupling
-        names = [model.joint(joint).name for joint in (first, second)]
+        name, leader = (model.joint(joint).name for joint in (first, second))
         if first in motors or first in followers:
-            raise AssetError(f"{what}: joint {names[0]!r} has a motor or follows another joint already")
+            raise ConfigError(f"an equality moves joint {name!r}, which has a motor or follows another joint already")
         if second not in motors:
-            raise AssetError(f"{what}: joint {names[0]!r} follows {names[1]!r}, which has no motor (see joints)")
+            raise ConfigError(f"joint {name!r} follows {leader!r}, which has no motor (see joints)")
         followers[first] = second, ratio, offset
         reach = np.sort(ratio * model.jnt_range[second] + offset)
         low, high = model.jnt_range[first]
         if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
-            raise AssetError(
-                f"{path}: joint {names[0]!r} has the range {low:.4g} to {high:.4g} rad, and {names[1]!r} takes it from "
+            raise ConfigError(
+                f"joint {name!r} has the range {low:.4g} to {high:.4g} rad, and {leader!r} takes it from "
                 f"{reach[0]:.4g} to {reach[1]:.4g}"
             )
     return followers
 
 
-def _hinges_of_bodies(model_path: Path, model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
+def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int) -> None:
+    """Every joint is a hinge that the TOML lists or that follows one, with limits; postures are within them: degrees,
+    in the TOML or as ranges of the MJCF, are not."""
+    import mujoco
+
+    motors = model.njnt - followers
+    hinges = np.all(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    if len(joints) != motors or len(set(joints)) != motors or not hinges:
+        raise ConfigError(
+            f"joints lists {len(set(joints))} of the {motors} joints of {table.model}; every joint must be "
+            "a hinge, and be listed once or follow one by an equality"
+        )
+    for name, values in {
+        "speed_limits": table.speed_limits,
+        "gains": table.gains or joints,
+        "grasp.posture": table.grasp.posture or joints,
+        "rotate.posture": table.rotate.posture or joints,
+    }.items():
+        if len(values) != len(joints):
+            raise ConfigError(f"{len(values)} {name} for {len(joints)} joints")
+    for place, (name, joint) in enumerate(zip(table.joints, joints, strict=True)):
+        (low, high), torque = model.jnt_range[joint], model.jnt_actfrcrange[joint]
+        if not model.jnt_limited[joint] or torque[1] <= 0 or not np.isclose(torque[0], -torque[1]):
+            raise ConfigError(
+                f"{table.model}: joint {name!r} needs a range, and an actuatorfrcrange from -T to T, its stall torque; "
+                f"got {torque[0]:g} to {torque[1]:g} Nm"
+            )
+        for angle in (posture[place] for posture in (table.grasp.posture, table.rotate.posture) if posture):
+            if not low - _SLACK <= angle <= high + _SLACK:
+                span = f"{low:.4g} to {high:.4g} rad"
+                raise ConfigError(f"posture: {angle:g} rad of {name!r} is outside of its range in the MJCF, {span}")
+
+
+def _hinges_of_bodies(model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
     """The model's joint [B] that moves each body; -1 for none."""
     hinges = np.full(len(row), -1)
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
         if body not in row or body == palm or hinges[row[body]] >= 0:
-            raise AssetError(
-                f"{model_path}: joint {model.joint(joint).name!r} must be the only joint of a body below "
-                f"{model.body(palm).name!r}"
+            raise ConfigError(
+                f"joint {model.joint(joint).name!r} must be the only joint of a body below {model.body(palm).name!r}"
             )
         hinges[row[body]] = joint
     return hinges
 
 
-def _find_tips(path: Path, model_path: Path, model: Any, table: HandFile, row: dict[int, int]) -> list[int]:
+def _find_tips(model: Any, table: HandFile, row: dict[int, int]) -> list[int]:
     """Each finger's tip site; its root joint must be one of the TOML's, and move it."""
     tips: list[int] = []
     for finger in table.fingers:
-        tip = _find(path, model_path, model, "site", finger.tip)
+        tip, root = model.site(finger.tip).id, model.joint(finger.root_joint).id
         body = int(model.site_bodyid[tip])
         if body not in row:
-            raise AssetError(f"{path}: tip {finger.tip!r} is on no body of {table.palm!r}")
+            raise ConfigError(f"tip {finger.tip!r} is on no body of {table.palm!r}")
         if body in model.site_bodyid[tips]:  # the physics gives the force on a link, not where on it
-            raise AssetError(f"{path}: tip {finger.tip!r} is on {model.body(body).name!r}, as another finger's tip")
+            raise ConfigError(f"tip {finger.tip!r} is on {model.body(body).name!r}, as another finger's tip")
         if finger.root_joint not in table.joints:
-            raise AssetError(f"{path}: root_joint {finger.root_joint!r} is not among joints")
-        root = _find(path, model_path, model, "joint", finger.root_joint)
+            raise ConfigError(f"root_joint {finger.root_joint!r} is not among joints")
         if not is_below(model.body_parentid, body, int(model.jnt_bodyid[root])):
-            raise AssetError(f"{path}: root_joint {finger.root_joint!r} does not move the tip {finger.tip!r}")
+            raise ConfigError(f"root_joint {finger.root_joint!r} does not move the tip {finger.tip!r}")
         tips.append(tip)
     return tips
 
 
-def _check_posture(path: Path, model: Any, joints: list[int], table: HandFile, task: str) -> None:
-    """A posture lies in the joints' ranges: degrees, in the TOML or as ranges of the MJCF, do not."""
-    posture = getattr(table, task).posture
-    if posture and len(posture) != len(joints):
-        raise AssetError(f"{path}: {task}.posture: expected {len(joints)} numbers, got {len(posture)}")
-    for name, joint, angle in zip(table.joints, joints, posture, strict=False):
-        low, high = model.jnt_range[joint]
-        if not low - _SLACK <= angle <= high + _SLACK:
-            raise AssetError(
-                f"{path}: {task}.posture: {angle:g} rad of {name!r} is outside of its range in the MJCF, "
-                f"{low:.4g} to {high:.4g} rad"
-            )
-
-
-def _lay_taxels(path: Path, table: HandFile, geoms: tuple[Geom, ...], tip_body: np.ndarray) -> np.ndarray:
+def _lay_taxels(table: HandFile, geoms: tuple[Geom, ...], tip_body: np.ndarray) -> np.ndarray:
     """The taxels [F, N, 7] of lattices on the fingers' pads: position, normal, area in the tip bodies' frames."""
-    rows = []
+    taxels = []
     for finger, body in zip(table.fingers, tip_body, strict=True):
-        where = f"{path}: finger {finger.name!r}"
-        pads = [geom for geom in geoms if geom.name == finger.pad and geom.body == body]
-        if len(pads) != 1 or pads[0].kind not in ("capsule", "sphere"):
-            raise AssetError(f"{where}: pad = {finger.pad!r}: expected a capsule or sphere of the tip's body")
-        pad = pads[0]
-        half = float(pad.size[1]) if pad.kind == "capsule" else 0.0
-        try:
-            points = lattice(*table.taxel_grid, pitch=table.taxel_pitch or 0.0)
-            patch = on_surface(pad.kind, points, radius=float(pad.size[0]), half_length=half)
-        except ConfigError as error:
-            raise AssetError(f"{where}: {error}") from None
-        patch = placed(patch, position=pad.position, rotation=_pad_frame(where, pad, finger.facing))
-        rows.append(np.concatenate([patch.position, patch.normal, patch.area[:, None]], -1))
-    return np.asarray(rows, np.float32)
+        with naming_file(f"finger {finger.name!r}"):
+            pads = [geom for geom in geoms if geom.name == finger.pad and geom.body == body]
+            if len(pads) != 1 or pads[0].kind not in ("capsule", "sphere"):
+                raise ConfigError(f"pad = {finger.pad!r}: expected a capsule or sphere of the tip's body")
+            (pad,) = pads
+            rows = lay_taxels(
+                pad.kind,
+                table.taxel_grid,
+                pitch=table.taxel_pitch or 0.0,
+                radius=float(pad.size[0]),
+                half_length=float(pad.size[1]),
+                position=pad.position,
+                rotation=_pad_frame(pad, finger.facing),
+            )
+        taxels.append(rows)
+    return np.asarray(taxels, np.float32)
 
 
-def _pad_frame(where: str, pad: Geom, facing: tuple[float, float, float] | None) -> np.ndarray:
+def _pad_frame(pad: Geom, facing: tuple[float, float, float] | None) -> np.ndarray:
     """The rotation [3, 3] that takes a primitive's axis, z, to the pad's, and x to the direction that it faces."""
     along = np.asarray(pad.rotation[:, 2], float)
     direction = np.asarray(facing or along, float)
     across = direction - np.dot(direction, along) * along
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(direction):
-        raise AssetError(f"{where}: facing = {facing}: expected a direction across the pad {pad.name!r}")
+        raise ConfigError(f"facing = {facing}: expected a direction across the pad {pad.name!r}")
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(along, across), along], -1)
 
@@ -371,7 +379,7 @@ def is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
     return body == ancestor
 
 
-def _read_geoms(path: Path, model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
+def _read_geoms(model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
     names = SHAPES | {0: "plane"}
     geoms = []
     for g in range(model.ngeom):
@@ -380,8 +388,8 @@ def _read_geoms(path: Path, model: Any, row: dict[int, int]) -> tuple[Geom, ...]
         if body not in row:
             continue
         if kind is None and touches:
-            raise AssetError(
-                f"{path}: geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r} is no primitive and "
+            raise ConfigError(
+                f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r} is no primitive and "
                 "touches: meshes are drawn only (contype and conaffinity 0); use capsules, spheres or boxes"
             )
         if kind is not None:

@@ -118,7 +118,7 @@ def mirror_toml(text: str, stem: str) -> str:
 
 
 def mirror_mjcf(model: ElementTree.Element) -> None:
-    """Mirror an MJCF without includes, in place."""
+    """Mirror an MJCF, in place."""
     order = next((c.attrib["eulerseq"] for c in model.iter("compiler") if "eulerseq" in c.attrib), "xyz")
     signs = _SIGNS | {"euler": tuple(i for i, axis in enumerate(order.lower()) if axis != "y")}
     first = model.find("default")
@@ -182,7 +182,6 @@ def write_mirror(path: Path, folder: Path) -> Path:
         raise AssetError(f"{toml}: exists; give another folder with --out")
     text = path.read_text()
     model = ElementTree.parse(hand.model_path).getroot()
-    _paste_includes(model, hand.model_path.parent, hand.model_path.parent)
     files = dict(_gather_files(model, hand.model_path.parent))
     mirror_mjcf(model)
     comment = f" Mirror image of {hand.model_path.name} in the plane y = 0. "
@@ -202,21 +201,6 @@ def _negate(number: str) -> str:
     """The digits of a file with the other sign, so that mirroring twice gives the same number."""
     number = number.strip()
     return number if float(number) == 0 else number[1:] if number.startswith("-") else f"-{number.lstrip('+')}"
-
-
-def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
-    """Put the content of included files in their place. MuJoCo looks beside the model first, in `top`."""
-    children = []
-    for child in list(element):
-        if child.tag != "include":
-            _paste_includes(child, top, folder)
-            children.append(child)
-            continue
-        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
-        included = ElementTree.parse(file).getroot()
-        _paste_includes(included, top, file.parent)
-        children += included
-    element[:] = children
 
 
 def _gather_files(model: ElementTree.Element, folder: Path) -> Iterator[tuple[str, Path]]:

@@ -11,8 +11,7 @@ from typing import Any
 
 from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
 from dexsim.hand.description import Hand
-from dexsim.hand.files import DEFAULT, find_hand
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import DEFAULT, find_hand, load_hand
 from dexsim.hand.mirror import is_mirror_image
 
 Record = dict[str, Any]

@@ -1,6 +1,6 @@
 """A maker's description of a hand, URDF or MJCF, as plain arrays: the palm and the links that move on it.
 
-Everything is in one frame, the palm body's, with every hinge at 0. So a link has no frame of its own, and a joint is
+Everything is in one frame, the palm body's, with every hinge at 0. So a link has no frame of its own, and a hinge is
 an axis and a point on it. Units: m, rad, kg, Nm.
 """
 
@@ -13,8 +13,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim.core.errors import AssetError
+from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, primitive_mesh
+from dexsim.hand.fit import Capsule, PalmBox
 from dexsim.hand.load import is_below, read_coupling
 
 _LEAST_MASS = 1e-3  # kg, of a link that the file gives none
@@ -22,50 +23,72 @@ _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
 
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Joint:
-    """A hinge. `leader` names the joint that it follows: angle = offset + ratio * the leader's."""
-
-    name: str
-    axis: np.ndarray  # [3] unit
-    anchor: np.ndarray  # [3] m
-    low: float
-    high: float
-    torque: float = 0.0  # Nm, stall torque; 0: not known
-    speed: float = 0.0  # rad/s, no-load speed; 0: not known
-    leader: str = ""
-    ratio: float = 1.0
-    offset: float = 0.0
+Followers = dict[int, tuple[int, float, float]]
+"""Joints that follow another one: which, by what ratio, from what offset [rad]."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@dataclasses.dataclass(eq=False, kw_only=True)
 class Link:
-    """Bodies that move as one. The first link of a hand is its palm, which alone has no joint; parents come first."""
+    """Bodies that move as one, and the hinge that moves them; the palm, the first link of a hand, has none. Parents
+    come before their children."""
 
     name: str
     parent: int  # -1 for the palm
-    joint: Joint | None
-    mass: float
+    mass: float = _LEAST_MASS
     centre: np.ndarray  # [3] m, of mass
     inertia: np.ndarray  # [3, 3] kg m^2 about the centre
     surface: Any = None  # trimesh.Trimesh; None where the file has no shape that can be read
+    capsule: Capsule | None = None  # fitted to the surface; a fingertip's is its pad
+    joint: str = ""  # name of the hinge
+    axis: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # unit
+    anchor: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m, a point on the axis
+    low: float = 0.0
+    high: float = 0.0
+    torque: float = 0.0  # Nm, stall torque; 0: not known
+    speed: float = 0.0  # rad/s, no-load speed; 0: not known
+    leader: str = ""  # the hinge that this one follows: angle = offset + ratio * the leader's
+    ratio: float = 1.0
+    offset: float = 0.0
+
+    @property
+    def is_motor(self) -> bool:
+        """Whether the hinge has a motor of its own."""
+        return bool(self.joint) and not self.leader
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Description:
-    """What a maker's file says of a hand."""
+@dataclasses.dataclass(eq=False, kw_only=True)
+class Draft:
+    """A hand on the way from a maker's file to a folder. `read_hand` begins it, in the file's axes; `anatomy.orient`
+    finds fingers and signs and turns it into the library's palm frame; later steps fill in the rest."""
 
     name: str
     kind: str  # MJCF or URDF
-    links: tuple[Link, ...]
+    links: list[Link]
     frozen: tuple[str, ...]  # joints that were taken for fixed: of a wrist, an arm, a floating base
-    notes: tuple[str, ...]  # what could not be read
+    notes: list[str]  # what could not be read, and what is in doubt
+    # From `anatomy.orient`.
+    fingers: dict[str, list[int]] = dataclasses.field(default_factory=dict)  # links up to the tip's; thumb first
+    rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))  # rows: palm axes in the file's
+    reversed: tuple[str, ...] = ()  # joints whose sign was turned round
+    side: str = "right"  # or left
+    # From `import_hand.fit_links`.
+    palm: PalmBox | None = None
+    assumed: list[str] = dataclasses.field(default_factory=list)
+    # Of the first grasp, from `posture.find_grasp` and `import_hand.force_targets`.
+    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
+    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
+    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
+
+    @property
+    def motors(self) -> list[Link]:
+        """Links with a motor, finger by finger: the order of joints in the TOML."""
+        order = dict.fromkeys(at for chain in self.fingers.values() for at in chain)
+        return [self.links[at] for at in order if self.links[at].is_motor]
 
 
-def read_description(
+def read_hand(
     path: Path, *, palm: str = "", freeze: Sequence[str] = (), couple: Sequence[str] = (), drop_tendons: bool = False
-) -> Description:
+) -> Draft:
     """Read a hand from a URDF or MJCF.
 
     Args:
@@ -77,35 +100,41 @@ def read_description(
     Raises:
       AssetError: not readable, not a hand, or something that a hand's folder cannot hold.
     """
-    if not path.is_file():
-        raise AssetError(f"{path}: no such file")
     try:
-        root = ElementTree.fromstring(path.read_bytes())
+        return _read(path, palm, freeze, couple, drop_tendons)
     except ElementTree.ParseError as error:
         raise AssetError(f"{path}: invalid XML: {error}") from None
-    if root.tag not in ("robot", "mujoco"):
-        raise AssetError(f"{path}: expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
-    notes: list[str] = []
-    try:
-        if root.tag == "robot":
-            spec, speeds = _read_urdf(path, root, notes), _urdf_speeds(root)
-        else:
-            spec, speeds = _read_mjcf(path, notes), {}
-        tendons = [tendon.name for tendon in spec.tendons]
-        if tendons and not drop_tendons:
-            raise AssetError(
-                f"{path}: tendons {', '.join(tendons)[:60]}: not supported; --drop-tendons gives each of their joints "
-                "a motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another (ratio of their angles)"
-            )
-        if tendons:
-            pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
-            for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
-                spec.delete(element)
-        model = spec.compile()
-    except ValueError as error:
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except (ValueError, ConfigError) as error:
         raise AssetError(f"{path}: {' '.join(str(error).split())}") from None
-    reader = _Reader(path, model, notes)
-    return reader.read(root.get("name") or root.get("model") or path.stem, root.tag, palm, freeze, couple, speeds)
+
+
+def _read(path: Path, palm: str, freeze: Sequence[str], couple: Sequence[str], drop_tendons: bool) -> Draft:
+    root, notes = ElementTree.fromstring(path.read_bytes()), list[str]()
+    if root.tag not in ("robot", "mujoco"):
+        raise ConfigError(f"expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
+    spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
+    if spec.tendons:
+        _drop_tendons(spec, drop_tendons)
+    model = spec.compile()
+    names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
+    if unknown := set(freeze) - set(names):
+        raise ConfigError(f"--freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
+    at = _find_palm(model, palm, {j for j, joint in enumerate(names) if joint in freeze})
+    below = [b for b in range(model.nbody) if b != at and is_below(model.body_parentid, b, at)]
+    joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
+    for j in joints:
+        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ConfigError(f"joint {names[j]!r} is not a hinge: --freeze {names[j]} fixes it at 0")
+    followers = _read_followers(model, names, joints, couple, notes)
+    return Draft(
+        name=root.get("name") or root.get("model") or path.stem,
+        kind="URDF" if root.tag == "robot" else "MJCF",
+        links=_read_links(model, at, below, joints, names, followers, _urdf_speeds(root)),
+        frozen=tuple(name for j, name in enumerate(names) if j not in joints),
+        notes=notes,
+    )
 
 
 def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoco.MjSpec:
@@ -165,11 +194,9 @@ def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, byte
 
 def _find_file(path: Path, name: str) -> Path:
     """A mesh that a URDF names: beside it, or below any folder above it that has the rest of the name."""
-    rest = Path(name.partition("://")[2] if "://" in name else name)
-    places = [path.parent / rest]
-    parts = rest.parts[1:] if name.startswith("package://") else rest.parts
-    places += [folder.joinpath(*parts) for folder in path.resolve().parents]
-    places += [folder / rest for folder in path.resolve().parents]
+    rest = Path(name.partition("://")[2] or name)
+    names = [Path(*rest.parts[1:]), rest] if name.startswith("package://") else [rest]
+    places = [path.parent / rest, *(folder / part for part in names for folder in path.resolve().parents)]
     return next((place for place in places if place.is_file()), places[0])
 
 
@@ -188,7 +215,7 @@ def _tensor(inertia: ElementTree.Element) -> np.ndarray:
 def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
     """The file without the shapes whose meshes are missing."""
     if path.suffix != ".xml":
-        raise AssetError(f"{path}: MuJoCo opens an MJCF only as .xml: rename it")
+        raise ConfigError("MuJoCo opens an MJCF only as .xml: rename it")
     spec = mujoco.MjSpec.from_file(str(path))
     folder = path.parent / (spec.meshdir or "")
     missing = {mesh.name for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()}
@@ -200,187 +227,172 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
     return spec
 
 
-class _Reader:
-    """A compiled model on its way to a `Description`."""
+def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
+    if not allowed:
+        raise ConfigError(
+            f"tendons {', '.join(tendon.name for tendon in spec.tendons)[:60]}: not supported; --drop-tendons "
+            "gives each of their joints a motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another "
+            "(ratio of their angles)"
+        )
+    pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
+    for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
+        spec.delete(element)
 
-    def __init__(self, path: Path, model: mujoco.MjModel, notes: list[str]):
-        self.path, self.model, self.notes = path, model, notes
-        self.data = mujoco.MjData(model)
-        hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-        self.data.qpos[model.jnt_qposadr[hinge]] = 0.0
-        mujoco.mj_kinematics(model, self.data)
 
-    def read(
-        self, name: str, tag: str, palm: str, freeze: Sequence[str], couple: Sequence[str], speeds: dict[str, float]
-    ) -> Description:
-        model = self.model
-        names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
-        if unknown := set(freeze) - set(names):
-            raise AssetError(f"{self.path}: --freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
-        at = self._find_palm(palm, {j for j, joint in enumerate(names) if joint in freeze})
-        below = [b for b in range(model.nbody) if b != at and is_below(model.body_parentid, b, at)]
-        joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
-        for j in joints:
-            if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise AssetError(f"{self.path}: joint {names[j]!r} is not a hinge: --freeze {names[j]} fixes it at 0")
-        followers = self._followers(names, joints, couple)
-        torques = self._torques()
-        axes, anchors = self.data.xaxis.copy(), self.data.xanchor.copy()
-        turn, origin = self.data.xmat[at].reshape(3, 3), self.data.xpos[at]
-        moving = {int(model.jnt_bodyid[j]) for j in joints}
-        links, row = [self._link(at, -1, None, at, moving)], {at: 0}
-        for body in (b for b in below if b in moving):
-            above = int(model.body_parentid[body])
-            while above not in row:
-                above = int(model.body_parentid[above])
-            own = [j for j in joints if model.jnt_bodyid[j] == body]
-            for j in own:
-                low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
-                leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
-                joint = Joint(
-                    name=names[j],
-                    axis=turn.T @ axes[j],
-                    anchor=turn.T @ (anchors[j] - origin),
-                    low=float(low),
-                    high=float(high),
-                    torque=torques.get(j, 0.0),
-                    speed=speeds.get(names[j], 0.0),
-                    leader=names[leader] if leader >= 0 else "",
-                    ratio=ratio,
-                    offset=offset,
-                )
-                parent = len(links) - 1 if j != own[0] else row[above]
-                links.append(self._link(body if j == own[-1] else -1, parent, joint, at, moving))
-            row[body] = len(links) - 1
-        kept = {link.joint.name for link in links if link.joint}
-        frozen = tuple(joint for joint in names if joint not in kept)
-        kind = {"robot": "URDF", "mujoco": "MJCF"}[tag]
-        return Description(name=name, kind=kind, links=tuple(links), frozen=frozen, notes=tuple(self.notes))
+def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
+    """The body from which all chains of hinges branch off."""
+    if palm:
+        at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, palm)
+        if at < 0:
+            bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
+            raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
+        return at
+    chains: dict[int, list[int]] = {}
+    for body in {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}:
+        chains[body] = [body]
+        while chains[body][-1]:
+            chains[body].append(int(model.body_parentid[chains[body][-1]]))
+    inner = {above for chain in chains.values() for above in chain[1:]}
+    fingers = [chain for body, chain in chains.items() if body not in inner]
+    if len(fingers) < 2:
+        raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
+    return next(body for body in fingers[0] if all(body in chain for chain in fingers))
 
-    def _find_palm(self, palm: str, frozen: set[int]) -> int:
-        """The body from which all chains of hinges branch off."""
-        model = self.model
-        if palm:
-            at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, palm)
-            if at < 0:
-                bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
-                raise AssetError(f"{self.path}: --palm {palm}: no such body; it has {bodies[:300]}")
-            return at
-        moving = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
-        paths = []
-        for body in moving:
-            if not any(other != body and is_below(model.body_parentid, other, body) for other in moving):
-                path = [body]
-                while path[-1]:
-                    path.append(int(model.body_parentid[path[-1]]))
-                paths.append(path[::-1])
-        if len(paths) < 2:
-            raise AssetError(f"{self.path}: expected a hand of two fingers or more, got {len(paths)} chains of hinges")
-        depth = 0
-        while all(len(path) > depth + 1 and path[depth + 1] == paths[0][depth + 1] for path in paths):
-            depth += 1
-        return paths[0][depth]
 
-    def _link(self, body: int, parent: int, joint: Joint | None, palm: int, moving: set[int]) -> Link:
-        """A link of a body and what is fixed to it. -1: the first of two hinges of one body, a link of its own."""
-        import trimesh
-
-        if body < 0:
-            assert joint is not None
-            small = _LEAST_INERTIA * np.eye(3)
-            return Link(
-                name=f"{joint.name}_link", parent=parent, joint=joint, mass=_LEAST_MASS, centre=joint.anchor,
-                inertia=small,
-            )  # fmt: skip
-        model, data = self.model, self.data
-        members = [body]
-        for other in range(body + 1, model.nbody):
-            if int(model.body_parentid[other]) in members and other not in moving:
-                members.append(other)
-        turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
-        masses = model.body_mass[members]
-        # MuJoCo puts the centre of a body without mass and shape anywhere.
-        places = np.where((masses > _NO_MASS)[:, None], data.xipos[members], data.xpos[members])
-        places = (places - origin) @ turn
-        mass = float(masses.sum())
-        centre = masses @ places / mass if mass > 0 else places[0]
-        axes, arms = turn.T @ data.ximat[members].reshape(-1, 3, 3), places - centre
-        inertia = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia[members], axes)
-        inertia += np.sum(masses * np.sum(arms**2, 1)) * np.eye(3) - (masses * arms.T) @ arms  # parallel axes
-        parts = [shape for b in members for shape in self._shapes_of(b)]
-        surface = trimesh.util.concatenate(parts) if parts else None
-        if surface is not None:
-            surface.apply_translation(-origin)
-            surface.apply_transform(np.block([[turn.T, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
-        name = model.body(body).name if body else "palm"
-        name = name or f"link_{body}"
-        return Link(
-            name=name, parent=parent, joint=joint, mass=mass, centre=centre, inertia=inertia, surface=surface
-        )  # fmt: skip
-
-    def _shapes_of(self, body: int) -> list[Any]:
-        """The shapes of a body in the world: its meshes, or else its primitives."""
-        model = self.model
-        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
-        meshes = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH]
-        return [self._geom(g) for g in meshes or geoms if model.geom_type[g] in SHAPES or g in meshes]
-
-    def _geom(self, g: int) -> Any:
-        import trimesh
-
-        model = self.model
-        if kind := SHAPES.get(model.geom_type[g]):
-            shape = primitive_mesh(kind, model.geom_size[g])
+def _read_followers(
+    model: mujoco.MjModel, names: list[str], joints: list[int], couple: Sequence[str], notes: list[str]
+) -> Followers:
+    direct: Followers = {}
+    for e in range(model.neq):
+        coupling = read_coupling(model, e)
+        if coupling is None:
+            notes.append(f"equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints")
         else:
+            direct[coupling[0]] = coupling[1:]
+    for text in couple:
+        follower, _, rest = text.partition("=")
+        leader, _, number = rest.partition(":")
+        try:
+            direct[names.index(follower)] = names.index(leader), float(number or 1), 0.0
+        except ValueError:
+            which = f"joints of {', '.join(names)}"
+            raise ConfigError(f"--couple {text}: expected FOLLOWER=LEADER:RATIO, {which}") from None
+    followers = {}
+    for first, (motor, ratio, offset) in direct.items():
+        for _ in range(len(direct)):  # a follower of a follower
+            if motor in direct:
+                above, factor, shift = direct[motor]
+                motor, ratio, offset = above, ratio * factor, offset + ratio * shift
+        if motor in joints and motor != first:
+            followers[first] = motor, ratio, offset
+    return followers
+
+
+def _stall_torques(model: mujoco.MjModel) -> dict[int, float]:
+    """Stall torque of each joint: its own limit, or that of the actuator on it."""
+    torques = {j: float(model.jnt_actfrcrange[j, 1]) for j in range(model.njnt) if model.jnt_actfrclimited[j]}
+    for a in range(model.nu):
+        j, gear = int(model.actuator_trnid[a, 0]), abs(model.actuator_gear[a, 0])
+        if model.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or j in torques:
+            continue
+        if model.actuator_forcelimited[a]:
+            torques[j] = float(gear * model.actuator_forcerange[a, 1])
+        elif model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
+            torques[j] = float(gear * model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a, 1])
+    return torques
+
+
+def _read_links(
+    model: mujoco.MjModel,
+    palm: int,
+    below: list[int],
+    joints: list[int],
+    names: list[str],
+    followers: Followers,
+    speeds: dict[str, float],
+) -> list[Link]:
+    """The palm and a link for each of `joints`; of two hinges on one body the first moves a link without a shape."""
+    data, torques = mujoco.MjData(model), _stall_torques(model)
+    data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
+    moving = {int(model.jnt_bodyid[j]) for j in joints}
+    links = [Link(parent=-1, **_read_body(model, data, palm, palm, moving))]
+    row = {palm: 0}
+    for body in (b for b in below if b in moving):
+        above = int(model.body_parentid[body])
+        while above not in row:
+            above = int(model.body_parentid[above])
+        own = [j for j in joints if model.jnt_bodyid[j] == body]
+        for j in own:
+            anchor = turn.T @ (data.xanchor[j] - origin)
+            content = {"name": f"{names[j]}_link", "centre": anchor, "inertia": _LEAST_INERTIA * np.eye(3)}
+            if j == own[-1]:
+                content = _read_body(model, data, palm, body, moving)
+            low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
+            leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
+            link = Link(
+                parent=row[above] if j == own[0] else len(links) - 1,
+                joint=names[j],
+                axis=turn.T @ data.xaxis[j],
+                anchor=anchor,
+                low=float(low),
+                high=float(high),
+                torque=torques.get(j, 0.0),
+                speed=speeds.get(names[j], 0.0),
+                leader=names[leader] if leader >= 0 else "",
+                ratio=ratio,
+                offset=offset,
+                **content,
+            )
+            links.append(link)
+        row[body] = len(links) - 1
+    return links
+
+
+def _read_body(model: mujoco.MjModel, data: mujoco.MjData, palm: int, body: int, moving: set[int]) -> dict[str, Any]:
+    """Name, mass and surface of a body with all that is fixed to it, in the palm's frame: fields of `Link`."""
+    import trimesh
+
+    members = [body]
+    for other in range(body + 1, model.nbody):
+        if int(model.body_parentid[other]) in members and other not in moving:
+            members.append(other)
+    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
+    masses = model.body_mass[members]
+    # MuJoCo puts the centre of a body without mass and shape anywhere.
+    places = np.where((masses > _NO_MASS)[:, None], data.xipos[members], data.xpos[members])
+    places = (places - origin) @ turn
+    mass = float(masses.sum())
+    centre = masses @ places / mass if mass > 0 else places[0]
+    axes, arms = turn.T @ data.ximat[members].reshape(-1, 3, 3), places - centre
+    inertia = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia[members], axes)
+    inertia += np.sum(masses * np.sum(arms**2, 1)) * np.eye(3) - (masses * arms.T) @ arms  # parallel axes
+    parts = [shape for b in members for shape in _read_shapes(model, data, b)]
+    surface = trimesh.util.concatenate(parts) if parts else None
+    if surface is not None:
+        surface.vertices = (surface.vertices - origin) @ turn
+    name = (model.body(body).name if body else "palm") or f"link_{body}"
+    return {"name": name, "mass": mass, "centre": centre, "inertia": inertia, "surface": surface}
+
+
+def _read_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[Any]:
+    """The shapes of a body in the world: its meshes, or else its primitives."""
+    import trimesh
+
+    geoms = np.flatnonzero(model.geom_bodyid == body)
+    meshes = geoms[model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH]
+    shapes = []
+    for g in meshes if len(meshes) else geoms:
+        if kind := SHAPES.get(int(model.geom_type[g])):
+            shape = primitive_mesh(kind, model.geom_size[g])
+        elif len(meshes):
             mesh = model.geom_dataid[g]
             vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
             faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
             shape = trimesh.Trimesh(vertices, faces, process=False)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.data.geom_xmat[g].reshape(3, 3), self.data.geom_xpos[g]
-        return shape.apply_transform(pose)
-
-    def _torques(self) -> dict[int, float]:
-        """Stall torque of each joint: its own limit, or that of the actuator on it."""
-        model = self.model
-        torques = {j: float(model.jnt_actfrcrange[j, 1]) for j in range(model.njnt) if model.jnt_actfrclimited[j]}
-        for a in range(model.nu):
-            j, gear = int(model.actuator_trnid[a, 0]), abs(model.actuator_gear[a, 0])
-            if model.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or j in torques:
-                continue
-            if model.actuator_forcelimited[a]:
-                torques[j] = float(gear * model.actuator_forcerange[a, 1])
-            elif model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
-                torques[j] = float(gear * model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a, 1])
-        return torques
-
-    def _followers(
-        self, names: list[str], joints: list[int], couple: Sequence[str]
-    ) -> dict[int, tuple[int, float, float]]:
-        """Joints that follow a motor's: which, by what ratio, from what offset [rad]."""
-        model = self.model
-        direct: dict[int, tuple[int, float, float]] = {}
-        for e in range(model.neq):
-            coupling = read_coupling(self.path, model, e)
-            if coupling is None:
-                self.notes.append(f"equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints")
-            else:
-                direct[coupling[0]] = coupling[1:]
-        for text in couple:
-            follower, _, rest = text.partition("=")
-            leader, _, number = rest.partition(":")
-            try:
-                direct[names.index(follower)] = names.index(leader), float(number or 1), 0.0
-            except ValueError:
-                raise AssetError(
-                    f"{self.path}: --couple {text}: expected FOLLOWER=LEADER:RATIO, joints of {', '.join(names)}"
-                ) from None
-        followers = {}
-        for first, (motor, ratio, offset) in direct.items():
-            for _ in range(len(direct)):  # a follower of a follower
-                if motor in direct:
-                    above, factor, shift = direct[motor]
-                    motor, ratio, offset = above, ratio * factor, offset + ratio * shift
-            if motor in joints and motor != first:
-                followers[first] = motor, ratio, offset
-        return followers
+        else:
+            continue
+        shape.vertices = shape.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+        shapes.append(shape)
+    return shapes

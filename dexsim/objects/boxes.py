@@ -50,7 +50,7 @@ class Boxes:
         )
 
 
-def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = ()) -> Boxes:
+def fit_boxes(mesh: meshes.Trimesh, parts: int, *, frames: Sequence[np.ndarray] = ()) -> Boxes:
     """At most `parts` boxes for a mesh; what was fitted once is kept in the cache.
 
     Args:
@@ -62,25 +62,25 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
         percentile), or its inside cannot be determined.
     """
     frames = (np.eye(3), *frames)
-    key = f"{mesh.fingerprint} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
+    key = f"{meshes.fingerprint(mesh)} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
     arrays = cached_arrays("boxes", key, lambda: vars(_fit(mesh, parts, frames)))
     boxes = Boxes(arrays["size"], arrays["position"], arrays["quat"], tuple(map(float, arrays["deviation"])))
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
         mean, worst = (1e3 * off for off in boxes.deviation)
         raise AssetError(
-            f"{mesh.name}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
+            f"{mesh.metadata['name']}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
             f"average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
             "(ObjectConfig.mesh_parts)"
         )
     return boxes
 
 
-def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
+def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     meshes.check_sign(mesh)
     rng = np.random.default_rng(0)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    skin, normal, _ = meshes.sample_surface(mesh, 3000, rng)
+    skin, normal = meshes.sample_surface(mesh, 3000, rng)
     low, high = mesh.bounds + [[-0.03 * extent], [0.03 * extent]]
     near = skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal
     points = np.concatenate([near, rng.uniform(low, high, (1500, 3))])
@@ -97,9 +97,9 @@ def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     )
 
 
-def _start(mesh: meshes.Mesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> dict[str, jax.Array]:
+def _start(mesh: meshes.Trimesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> dict[str, jax.Array]:
     """Boxes along the columns of `frame`: "position" [K, 3], "size" [K, 3] (logarithms), "quat" [K, 4]."""
-    low, high = _grow(meshes.Mesh(mesh.name, mesh.vertices @ frame, mesh.faces), parts, rng)
+    low, high = _grow(meshes.make_mesh("", mesh.vertices @ frame, mesh.faces), parts, rng)
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(frame, np.float64).ravel())
     values = {
@@ -110,7 +110,7 @@ def _start(mesh: meshes.Mesh, frame: np.ndarray, parts: int, rng: np.random.Gene
     return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
 
 
-def _grow(mesh: meshes.Mesh, parts: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Corners [K, 3] of boxes along the mesh's axes that fill it, the most useful first."""
     low, high = mesh.bounds
     pitch = float((high - low).max()) / _VOXELS
@@ -206,7 +206,7 @@ def _refine(
     return jax.lax.scan(step, (params, zero, zero), jnp.arange(_STEPS, dtype=jnp.float32))[0][0]
 
 
-def _boxes(mesh: meshes.Mesh, params: dict[str, jax.Array], rng: np.random.Generator) -> Boxes:
+def _boxes(mesh: meshes.Trimesh, params: dict[str, jax.Array], rng: np.random.Generator) -> Boxes:
     quat = np.asarray(params["quat"], np.float64)
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     size, position = np.exp(np.asarray(params["size"], np.float64)), np.asarray(params["position"], np.float64)

@@ -4,6 +4,8 @@ The object's frame is at the mesh's centre of mass. Its axes are those of the fi
 the principal axes that are nearest to them.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import itertools
 from functools import lru_cache
@@ -22,7 +24,7 @@ _ALIGNED = 0.01  # products of inertia below this share of the mean moment are n
 class MeshObject:
     """A mesh of size 1 in its own frame. Make it with `load`."""
 
-    mesh: meshes.Mesh
+    mesh: meshes.Trimesh
     boxes: Boxes
     inertia: np.ndarray  # [3] m^2, of a uniform solid of 1 kg
     axes: np.ndarray  # [3, 3], the frame's axes in the file's, in columns
@@ -53,14 +55,12 @@ def _load(path: str, changed: int, unit: float, parts: int, repair: str) -> Mesh
         return from_mesh(meshes.load_mesh(path, scale=unit, repair=repair), parts)
 
 
-def from_mesh(mesh: meshes.Mesh, parts: int) -> MeshObject:
+def from_mesh(mesh: meshes.Trimesh, parts: int) -> MeshObject:
     """The object of a mesh that has been checked; see `load`."""
-    import trimesh
-
-    properties = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
+    properties = mesh.mass_properties
     tensor, origin = np.asarray(properties.inertia) / properties.mass, np.asarray(properties.center_mass)
     axes = principal_axes(tensor)
-    own = meshes.Mesh(mesh.name, (mesh.vertices - origin) @ axes, mesh.faces)
+    own = meshes.make_mesh(mesh.metadata["name"], (mesh.vertices - origin) @ axes, mesh.faces)
     inertia = np.diag(axes.T @ tensor @ axes).astype(np.float32)
     # An L has its bars along the axes of its file.
     frames = () if np.array_equal(axes, np.eye(3)) else (axes.T,)

@@ -9,8 +9,24 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.render.camera import Camera, CameraView, look, unit
-from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, linear
 from dexsim.render.panel import force_color
+
+# Of hand, object and goal, in the live view too: sRGB bytes.
+Color = tuple[int, int, int]
+
+PALM: Color = (62, 66, 72)
+LINK: Color = (172, 176, 182)
+TIP: Color = (58, 98, 92)
+OBJECT: Color = (52, 128, 172)
+FACES: tuple[Color, ...] = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (204, 121, 167),
+)
+"""Sides of a box, +x, -x, +y, -y, +z, -z: told apart also by eyes that see fewer colours (Okabe and Ito)."""
 
 _SUPERSAMPLE = 2  # rays a pixel, in each direction
 _FAR = 1e6  # m, the depth of a ray that hits nothing
@@ -21,10 +37,15 @@ _TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
 _GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m to the right and up of the middle
 
 # Linear RGB.
-_SIDES = np.array([linear(color) for color in FACES])
 _IDLE_TAXEL = (0.08, 0.09, 0.1)
 _SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]])
 _BACKDROP = np.array([[0.040, 0.047, 0.060], [0.012, 0.014, 0.019]])  # middle, corners
+
+
+def linear(color: Color) -> tuple[float, float, float]:
+    """A colour as linear light in [0, 1]."""
+    red, green, blue = (np.asarray(color) / 255) ** 2.2
+    return float(red), float(green), float(blue)
 
 
 class Pose(NamedTuple):
@@ -43,8 +64,7 @@ class Primitives(NamedTuple):
     size: np.ndarray  # [G, 3], m
     position: np.ndarray  # [G, 3], m
     rotation: np.ndarray  # [G, 3, 3]
-    color: np.ndarray  # [G, 3], linear RGB
-    sides: bool = False  # whether sides +x, -x, +y, -y, +z, -z have the colours of `FACES` instead
+    color: np.ndarray  # [G, 6, 3], linear RGB of what faces +x, -x, +y, -y, +z, -z
 
 
 class Surface(NamedTuple):
@@ -90,24 +110,19 @@ def draw_scene(
     force_range: float,
 ) -> np.ndarray:
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
-    view = look(camera, size, _SUPERSAMPLE)
-    rays = view.rays()
-    color = _backdrop(view.size).copy()
+    canvas = _Canvas(camera, size)
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
-
-    links = cast(body, view, rays)
-    _paint(color, body, links, links.primitive >= 0, rays, view, camera)
-    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view)
-    front = cast(held, view, rays)
-    _paint(color, held, front, front.depth < links.depth, rays, view, camera, _OBJECT_OPACITY)
+    links, front = canvas.cast(body), canvas.cast(held)
+    canvas.paint(body, links, links.primitive >= 0)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth)
+    canvas.paint(held, front, front.depth < links.depth, _OBJECT_OPACITY)
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
-    _paint_taxels(color, pose, frame.taxel_force, force_range, links.depth, view, _TAXEL_GLOW)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth, _TAXEL_GLOW)
     if frame.goal_rotation is not None:
         goal = goal_primitives(held, frame, camera)
-        marker = cast(goal, view, rays)
-        nearest = np.minimum(links.depth, front.depth)
-        _paint(color, goal, marker, marker.depth < nearest, rays, view, camera, _GOAL_OPACITY)
-    return _develop(color)
+        marker = canvas.cast(goal)
+        canvas.paint(goal, marker, marker.depth < np.minimum(links.depth, front.depth), _GOAL_OPACITY)
+    return canvas.develop()
 
 
 def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
@@ -122,7 +137,7 @@ def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
         np.array([geom.size for geom in geoms]),
         pose.body_position[body] + position,
         turn @ np.array([geom.rotation for geom in geoms]),
-        np.array([linear(tone) for tone in tones]),
+        np.array([[linear(tone)] * 6 for tone in tones]),
     )
 
 
@@ -130,13 +145,13 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
     """The object's active primitives, posed in the palm frame."""
     active = np.flatnonzero(frame.primitive_active)
     kind = tuple(kinds[k] for k in active)
+    tones = FACES if kind == ("box",) else (OBJECT,) * 6
     return Primitives(
         kind,
         frame.primitive_size[active],
         frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T,
         frame.object_rotation @ frame.primitive_rotation[active],
-        np.tile(linear(OBJECT), (len(active), 1)),
-        kind == ("box",),
+        np.tile([linear(tone) for tone in tones], (len(active), 1, 1)),
     )
 
 
@@ -170,65 +185,64 @@ def cast(primitives: Primitives, view: CameraView, rays: np.ndarray) -> Surface:
     return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
 
 
-def _paint(
-    color: np.ndarray,
-    primitives: Primitives,
-    surface: Surface,
-    seen: np.ndarray,
-    rays: np.ndarray,
-    view: CameraView,
-    camera: Camera,
-    opacity: float = 1.0,
-) -> None:
-    """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the picture,
-    linear RGB [H, W, 3]."""
-    index, normal = surface.primitive[seen], surface.normal[seen]
-    up = unit(np.asarray(camera.up, float))
-    light = unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])  # over the camera's right shoulder
-    away = (1 - np.clip(-np.sum(normal * unit(rays[seen]), -1), 0, 1))[:, None]
-    shade = _GROUND + (0.5 + 0.5 * normal @ up)[:, None] * (_SKY - _GROUND)
-    shade += np.maximum(normal @ light, 0)[:, None] * _KEY
-    shade *= _face_colors(primitives, normal) if primitives.sides else primitives.color[index]
-    shade += 0.1 * away**3  # a rim of light
-    # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
-    color[seen] += (opacity + (1 - opacity) * away**2) * (shade - color[seen])
+class _Canvas:
+    """A picture as it is painted, in linear light [H, W, 3], a colour for each of its rays."""
 
+    def __init__(self, camera: Camera, size: tuple[int, int]):
+        self.view = look(camera, size, _SUPERSAMPLE)
+        self.rays, self._color = self.view.rays(), _backdrop(self.view.size).copy()
+        self._up = unit(np.asarray(camera.up, float))
+        axes = self.view.axes
+        self._light = unit(0.55 * axes[0] + 0.75 * self._up + 0.75 * axes[2])  # over the camera's right shoulder
 
-def _face_colors(box: Primitives, normal: np.ndarray) -> np.ndarray:
-    """The colour [M, 3] of the side of a box that each `normal` [M, 3] is of."""
-    local = normal @ box.rotation[0]
-    axis = np.abs(local).argmax(-1)
-    return _SIDES[2 * axis + (local[np.arange(len(axis)), axis] < 0)]
+    def cast(self, primitives: Primitives) -> Surface:
+        """What of these each ray sees first."""
+        return cast(primitives, self.view, self.rays)
 
+    def paint(self, primitives: Primitives, surface: Surface, seen: np.ndarray, opacity: float = 1.0) -> None:
+        """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the
+        picture."""
+        index, normal = surface.primitive[seen], surface.normal[seen]
+        away = (1 - np.clip(-np.sum(normal * unit(self.rays[seen]), -1), 0, 1))[:, None]
+        shade = _GROUND + (0.5 + 0.5 * normal @ self._up)[:, None] * (_SKY - _GROUND)
+        shade += np.maximum(normal @ self._light, 0)[:, None] * _KEY
+        local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
+        axis = np.abs(local).argmax(-1)
+        shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
+        shade += 0.1 * away**3  # a rim of light
+        # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
+        self._color[seen] += (opacity + (1 - opacity) * away**2) * (shade - self._color[seen])
 
-def _paint_taxels(
-    color: np.ndarray,
-    pose: Pose,
-    force: np.ndarray,
-    force_range: float,
-    depth: np.ndarray,
-    view: CameraView,
-    glow: float | None = None,
-) -> None:
-    """The taxels that face the camera and that no link hides, as discs in the colour of their force [F, N] N; with
-    `glow` the loaded ones alone, laid over the picture with that weight. `depth` [H, W] m is that of the links."""
-    visible = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1) > 0
-    if glow is not None:
-        visible &= force > 0
-    level = force[visible]
-    hot = (force_color(level, force_range) / 255) ** 2.2
-    tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
-    pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
-    radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
-    width, height = view.size
-    for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
-        left, right = np.clip((int(x - r), int(x + r) + 2), 0, width)
-        top, bottom = np.clip((int(y - r), int(y + r) + 2), 0, height)
-        rows, columns = np.ogrid[top:bottom, left:right]
-        disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
-        disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT
-        part = color[top:bottom, left:right]
-        part[disc] += (1.0 if glow is None else glow) * (hue - part[disc])
+    def paint_taxels(
+        self, pose: Pose, force: np.ndarray, force_range: float, depth: np.ndarray, glow: float | None = None
+    ) -> None:
+        """The taxels that face the camera and that no link hides, as discs in the colour of their force [F, N] N; with
+        `glow` the loaded ones alone, laid over the picture with that weight. `depth` [H, W] m is that of the links."""
+        view = self.view
+        visible = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1) > 0
+        if glow is not None:
+            visible &= force > 0
+        level = force[visible]
+        hot = (force_color(level, force_range) / 255) ** 2.2
+        tone = np.where(level[:, None] > 0, hot, _IDLE_TAXEL)
+        pixel, away = view.project(pose.taxel_position[visible] + _TAXEL_LIFT * pose.taxel_normal[visible])
+        radius = _TAXEL_RADIUS * (1 + np.clip(level / force_range, 0, 1)) * view.scale / np.maximum(away, 1e-3)
+        width, height = view.size
+        for (x, y), r, z, hue in zip(pixel, radius, away, tone, strict=True):
+            left, right = np.clip((int(x - r), int(x + r) + 2), 0, width)
+            top, bottom = np.clip((int(y - r), int(y + r) + 2), 0, height)
+            rows, columns = np.ogrid[top:bottom, left:right]
+            disc = (columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 < r**2
+            disc &= z < depth[top:bottom, left:right] + _TAXEL_LIFT
+            part = self._color[top:bottom, left:right]
+            part[disc] += (1.0 if glow is None else glow) * (hue - part[disc])
+
+    def develop(self) -> np.ndarray:
+        """sRGB bytes of the picture's pixels."""
+        height, width, _ = self._color.shape
+        n = _SUPERSAMPLE
+        light = self._color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
+        return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)
 
 
 @lru_cache(maxsize=4)
@@ -238,11 +252,3 @@ def _backdrop(size: tuple[int, int]) -> np.ndarray:
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     edge = np.clip((x**2 + y**2) / 1.6, 0, 1)[..., None]
     return _BACKDROP[0] + (_BACKDROP[1] - _BACKDROP[0]) * edge
-
-
-def _develop(color: np.ndarray) -> np.ndarray:
-    """Linear light of all rays [H, W, 3] as sRGB bytes of pixels."""
-    height, width, _ = color.shape
-    n = _SUPERSAMPLE
-    light = color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
-    return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)

@@ -17,7 +17,7 @@ from dexsim.core.files import write_atomic
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.render.camera import Camera
-from dexsim.render.panel import draw_panel, make_layout, read_outs, taxel_image
+from dexsim.render.panel import Panel, read_outs, taxel_image
 from dexsim.render.picture import Pose, draw_scene, hand_poses
 from dexsim.render.snapshot import Snapshot
 
@@ -97,27 +97,25 @@ def render_episode(
     return _write_video(frame, len(poses), Path(path), rate, size)
 
 
-def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):
+def draw_taxels(hand: Hand, taxel_force: np.ndarray) -> Any:
     """A matplotlib figure of the unrolled taxel maps of forces [F, N] N: one per finger, tip at the top, one colour
-    scale; on a new figure, or a sequence of F axes."""
+    scale."""
     import matplotlib.pyplot as plt
 
     force = np.asarray(taxel_force)
-    if ax is None:
-        figure, axes = plt.subplots(1, len(hand.finger_names), figsize=(9, 2.9), layout="constrained", squeeze=False)
-        plt.close(figure)  # a notebook shows what the cell returns; left open it would be shown twice
-        ax = axes[0]
+    figure, axes = plt.subplots(1, len(hand.finger_names), figsize=(9, 2.9), layout="constrained", squeeze=False)
+    plt.close(figure)  # a notebook shows what the cell returns; left open it would be shown twice
     top = float(force.max()) or 1.0
     columns, rows = hand.taxel_grid
-    for axis, name, values in zip(ax, hand.finger_names, force, strict=True):
+    for axis, name, values in zip(axes[0], hand.finger_names, force, strict=True):
         extent = (-0.5, columns - 0.5, -0.5, rows - 0.5)
         image = axis.imshow(
             taxel_image(values, hand.taxel_grid), cmap="inferno", vmin=0, vmax=top, extent=extent, aspect="equal"
         )
         axis.set(title=f"{name}  {values.sum():.2f} N", xlabel="column")
-    ax[0].set_ylabel("row (tip at the top)")
-    ax[0].figure.colorbar(image, ax=list(ax), label="force per taxel [N]", shrink=0.85)
-    return ax[0].figure
+    axes[0, 0].set_ylabel("row (tip at the top)")
+    figure.colorbar(image, ax=list(axes[0]), label="force per taxel [N]", shrink=0.85)
+    return figure
 
 
 def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> Callable[[Snapshot, Pose], np.ndarray]:
@@ -129,17 +127,13 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
     if np.shape(snapshot.primitive_size)[-2] != len(kinds):
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
     camera = camera_of(camera, hand) if isinstance(camera, str) else camera
-    layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
+    panel = Panel(hand, panel_width, height)
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
     finger_range = finger_range or 1.0
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
-        panel = draw_panel(
-            layout, hand.finger_names, frame.taxel_force, frame.finger_force, read_outs(frame),
-            float(frame.target_force), force_range, finger_range,
-        )  # fmt: skip
-        return np.concatenate([scene, panel], 1)
+        return np.concatenate([scene, panel.draw(frame, force_range, finger_range, read_outs(frame))], 1)
 
     return draw
 

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, Range, setting
-from dexsim.core.pytree import pytree_dataclass
 
 DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 """Effects that are drawn at every episode start where they have a range."""
@@ -60,29 +59,13 @@ class TaxelSensor(Config):
     samples at the control rate."""
 
 
-@pytree_dataclass
-class TaxelParams:
-    """One episode's array; None for what is off."""
-
-    hysteresis: jax.Array | None  # [F, 1]
-    memory: jax.Array | None  # [F, 1], share of the late part that is still missing after a control tick
-    crosstalk: jax.Array | None  # [F, 1]
-    gain: jax.Array | None  # [F, N]
-    bias: jax.Array | None  # [F, N] N
-    drift: jax.Array | None  # [F, 1] N a tick
-    alive: jax.Array | None  # [F, N] bool
-    rate: jax.Array | None  # [] samples a control tick
-    phase: jax.Array | None  # [] in [0, 1), of the array's clock at the first tick
-
-
-@pytree_dataclass
-class TaxelMemory:
-    """What the array remembers from tick to tick; None for what is off."""
-
-    late: jax.Array | None  # [F, N] N, the force as the late part sees it
-    walk: jax.Array | None  # [F, N] N, drift so far
-    held: jax.Array | None  # [F, N] N, the last sample
-    clock: jax.Array | None  # [] periods of the array since its last sample; below 0 before the first tick
+TaxelParams = dict[str, jax.Array]
+"""One episode's array, without what is off: hysteresis, crosstalk, memory (the late part's share that is still missing
+after a tick) and drift (N a tick) [F, 1]; gain, bias (N) and alive (bool) [F, N]; rate (samples a tick) and phase of
+the array's clock []."""
+TaxelMemory = dict[str, jax.Array]
+"""What the array remembers, without what is off: late (the force as the late part sees it), walk (the drift so far) and
+held (the last sample) [F, N] N; clock [], periods since that sample, below 0 before the first tick."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,35 +86,34 @@ class TaxelArray:
         """Draw one episode's array; `scale` [] in [0, 1] is the width of all ranges about a perfect one."""
         sensor, each, finger = self.sensor, self.shape, (self.fingers, 1)
         keys = dict(zip((*DRAWN, "time", "alive", "phase"), jax.random.split(key, len(DRAWN) + 3), strict=True))
-
-        def draw(name: str, nominal: float, shape: tuple[int, ...]) -> jax.Array | None:
-            span = getattr(sensor, name)
-            return None if span is None else nominal + scale * (_uniform(keys[name], span, shape) - nominal)
-
-        drift, dead = draw("drift", 0.0, finger), draw("dead", 0.0, ())
-        time = _uniform(keys["time"], sensor.hysteresis_time, finger)
-        return TaxelParams(
-            hysteresis=draw("hysteresis", 0.0, finger),
-            memory=None if sensor.hysteresis is None else jnp.exp(-self.control_period / time),
-            crosstalk=draw("crosstalk", 0.0, finger),
-            gain=draw("gain", 1.0, each),
-            bias=draw("bias", 0.0, each),
-            drift=None if drift is None else drift * self.control_period**0.5,
-            alive=None if dead is None else jax.random.uniform(keys["alive"], each) >= dead,
-            rate=None if sensor.rate is None else self.control_period * _uniform(keys["rate"], sensor.rate, ()),
-            phase=None if sensor.rate is None else jax.random.uniform(keys["phase"], ()),
-        )
+        params: TaxelParams = {}
+        for name, nominal, shape in (
+            ("hysteresis", 0.0, finger),
+            ("crosstalk", 0.0, finger),
+            ("gain", 1.0, each),
+            ("bias", 0.0, each),
+            ("drift", 0.0, finger),
+            ("dead", 0.0, ()),
+        ):
+            if (span := getattr(sensor, name)) is not None:
+                params[name] = nominal + scale * (_uniform(keys[name], span, shape) - nominal)
+        if "hysteresis" in params:
+            params["memory"] = jnp.exp(-self.control_period / _uniform(keys["time"], sensor.hysteresis_time, finger))
+        if "drift" in params:
+            params["drift"] *= self.control_period**0.5
+        if "dead" in params:
+            params["alive"] = jax.random.uniform(keys["alive"], each) >= params.pop("dead")
+        if sensor.rate is not None:
+            params["rate"] = self.control_period * _uniform(keys["rate"], sensor.rate, ())
+            params["phase"] = jax.random.uniform(keys["phase"], ())
+        return params
 
     def init(self) -> TaxelMemory:
         """Before the first tick: nothing felt, nothing drifted."""
         sensor, nothing = self.sensor, jnp.zeros(self.shape)
-        slow = sensor.rate is not None
-        return TaxelMemory(
-            late=None if sensor.hysteresis is None else nothing,
-            walk=None if sensor.drift is None else nothing,
-            held=nothing if slow else None,
-            clock=jnp.full((), -1.0) if slow else None,
-        )
+        memory = {"late": sensor.hysteresis, "walk": sensor.drift, "held": sensor.rate}
+        clock = {} if sensor.rate is None else {"clock": jnp.full((), -1.0)}
+        return {name: nothing for name, effect in memory.items() if effect is not None} | clock
 
     def apply(
         self,
@@ -142,38 +124,33 @@ class TaxelArray:
         finger_gain: jax.Array | float = 1.0,
     ) -> tuple[TaxelMemory, jax.Array]:
         """One control tick: true forces [F, N] N in, readings [F, N] N out; `finger_gain` [F, 1] is on top."""
-        sensor, late, walk = self.sensor, memory.late, memory.walk
+        sensor, memory = self.sensor, dict(memory)
         value = load = force * finger_gain
-        # What is off is None in `params` and `memory` alike.
-        if late is not None:
-            assert params.memory is not None and params.hysteresis is not None
-            late = load + params.memory * (late - load)
-            value = value + params.hysteresis * (late - load)
-        if params.crosstalk is not None:
-            value = value + params.crosstalk / 4 * neighbour_difference(value, self.grid)
-        if params.gain is not None:
-            value = value * params.gain
-        if params.bias is not None:
-            value = value + params.bias
-        if walk is not None:
-            assert params.drift is not None
-            walk = walk + params.drift * jax.random.normal(jax.random.fold_in(key, 2), self.shape)
-            value = value + walk
+        if "late" in memory:
+            memory["late"] = load + params["memory"] * (memory["late"] - load)
+            value = value + params["hysteresis"] * (memory["late"] - load)
+        if "crosstalk" in params:
+            value = value + params["crosstalk"] / 4 * neighbour_difference(value, self.grid)
+        if "gain" in params:
+            value = value * params["gain"]
+        if "bias" in params:
+            value = value + params["bias"]
+        if "walk" in memory:
+            memory["walk"] += params["drift"] * jax.random.normal(jax.random.fold_in(key, 2), self.shape)
+            value = value + memory["walk"]
         value = value + sensor.noise * jax.random.normal(key, force.shape)
-        if params.alive is not None:
-            value = jnp.where(params.alive, value, 0.0)
+        if "alive" in params:
+            value = jnp.where(params["alive"], value, 0.0)
         value = jnp.where(value < sensor.threshold, 0.0, value)
         if sensor.resolution > 0:
             value = jnp.round(value / sensor.resolution) * sensor.resolution
         value = jnp.clip(value, 0.0, sensor.saturation)
-        held, clock = memory.held, memory.clock
-        if clock is not None:
-            assert held is not None and params.phase is not None and params.rate is not None
-            first = clock < 0
-            clock = jnp.where(first, params.phase, clock + params.rate)
-            value = jnp.where(first | (clock >= 1), value, held)
-            held, clock = value, clock - jnp.floor(clock)
-        return TaxelMemory(late, walk, held, clock), value
+        if "clock" in memory:
+            first = memory["clock"] < 0
+            clock = jnp.where(first, params["phase"], memory["clock"] + params["rate"])
+            value = jnp.where(first | (clock >= 1), value, memory["held"])
+            memory |= {"held": value, "clock": clock - jnp.floor(clock)}
+        return memory, value
 
 
 def neighbour_difference(force: jax.Array, grid: tuple[int, int]) -> jax.Array:

@@ -6,14 +6,14 @@ Geometry is sent once and then moved; a frame costs a few kilobytes.
 import dataclasses
 from typing import Any
 
+import mujoco
 import numpy as np
 import trimesh
 
 from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.render.camera import look
-from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
 from dexsim.render.panel import force_color
-from dexsim.render.picture import Pose, hand_poses
+from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, Pose, hand_poses
 from dexsim.render.render import camera_of
 from dexsim.view.source import Frame
 
@@ -21,6 +21,7 @@ _IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing
 _ARROW = (255, 190, 70)
 _METRES_PER_NEWTON = 0.006  # length of a force's arrow
 _GOAL_AT = 0.10  # m above the object, where the goal is shown
+_GOAL_SCALE = 0.6  # of the object, at which the goal is shown
 _AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
 _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
 _ABOVE = 8.0  # deg, lowest elevation of the camera at first
@@ -38,17 +39,10 @@ class Scene:
         server.scene.set_up_direction(view.up)
         server.scene.configure_default_lights(True, cast_shadow=False)
         server.scene.add_light_ambient("/light", intensity=1.2)
-        server.scene.add_grid(
-            "/floor",
-            width=1.2,
-            height=1.2,
-            plane="yz",  # Every preset's up is along x.
-            cell_size=0.05,
-            section_size=0.2,
-            cell_color=(52, 56, 64),
-            section_color=(78, 84, 94),
-            position=tuple(np.asarray(view.target) - _FLOOR * self._up),
-        )
+        size = {"width": 1.2, "height": 1.2, "cell_size": 0.05, "section_size": 0.2}
+        tones = {"cell_color": (52, 56, 64), "section_color": (78, 84, 94)}
+        place = tuple(np.asarray(view.target) - _FLOOR * self._up)
+        server.scene.add_grid("/floor", plane="yz", position=place, **size, **tones)  # Every preset's up is along x.
         # Above the floor, farther away than a film's camera, and aside: the controls cover a part of the page.
         above = max(view.elevation, _ABOVE)
         eye = look(dataclasses.replace(view, distance=_AWAY * view.distance, elevation=above), (4, 3))
@@ -60,15 +54,8 @@ class Scene:
         for number, geom in enumerate(hand.geoms):
             if geom.kind != "plane":
                 tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
-                mesh = primitive_mesh(geom.kind, geom.size)
-                server.scene.add_mesh_simple(
-                    f"/hand/{hand.body_names[geom.body]}/{number}",
-                    mesh.vertices,
-                    mesh.faces,
-                    color=tone,
-                    position=geom.position,
-                    wxyz=quaternion(geom.rotation),
-                )
+                name, mesh = f"/hand/{hand.body_names[geom.body]}/{number}", primitive_mesh(geom.kind, geom.size)
+                self._add_mesh(name, mesh, tone, geom.position, geom.rotation)
         # Each fingertip carries its taxels, so that they are in place however late a slow browser draws.
         self._taxels = [
             server.scene.add_point_cloud(
@@ -81,15 +68,8 @@ class Scene:
             )
             for finger, body in enumerate(hand.tip_body)
         ]
-        self._forces = server.scene.add_arrows(
-            "/forces",
-            np.zeros((1, 2, 3)),
-            _ARROW,
-            shaft_radius=0.0009,
-            head_radius=0.0022,
-            head_length=0.005,
-            visible=False,
-        )
+        shape = {"shaft_radius": 0.0009, "head_radius": 0.0022, "head_length": 0.005}
+        self._forces = server.scene.add_arrows("/forces", np.zeros((1, 2, 3)), _ARROW, **shape, visible=False)
         self._object = server.scene.add_frame("/object", show_axes=False, axes_length=0.03, axes_radius=0.001)
         self._goal = server.scene.add_frame("/goal", show_axes=False, visible=False)
 
@@ -128,25 +108,23 @@ class Scene:
         for root in ("/object/shape", "/goal/shape"):
             self._server.scene.remove_by_name(root)
         self._object.show_axes = len(active) == 0
-        for root in ("object", "goal"):
-            ghost = root == "goal"
+        for root, scale in (("object", 1.0), ("goal", _GOAL_SCALE)):
             for k in active:
-                mesh = primitive_mesh(frame.kinds[k], snapshot.primitive_size[k])
-                mesh.apply_scale(0.6 if ghost else 1.0)
-                parts = box_faces(mesh) if frame.kinds[k] == "box" and len(active) == 1 else [(OBJECT, mesh)]
+                box = frame.kinds[k] == "box"
+                mesh = primitive_mesh(frame.kinds[k], snapshot.primitive_size[k]).apply_scale(scale)
+                parts = box_faces(mesh) if box and len(active) == 1 else [(OBJECT, mesh)]
+                place, turn = scale * np.asarray(snapshot.primitive_position[k]), snapshot.primitive_rotation[k]
                 for number, (color, part) in enumerate(parts):
-                    self._server.scene.add_mesh_simple(
-                        f"/{root}/shape/{k}/{number}",
-                        part.vertices,
-                        part.faces,
-                        color=color,
-                        opacity=0.6,
-                        flat_shading=frame.kinds[k] == "box",
-                        position=np.asarray(snapshot.primitive_position[k]) * (0.6 if ghost else 1.0),
-                        wxyz=quaternion(snapshot.primitive_rotation[k]),
-                    )
-            if ghost and len(active):
-                self._server.scene.add_label("/goal/shape/label", "goal")
+                    name = f"/{root}/shape/{k}/{number}"
+                    self._add_mesh(name, part, color, place, turn, opacity=0.6, flat_shading=box)
+        if len(active):
+            self._server.scene.add_label("/goal/shape/label", "goal")
+
+    def _add_mesh(
+        self, name: str, mesh: trimesh.Trimesh, color: Color, place: np.ndarray, turn: np.ndarray, **options: Any
+    ) -> None:
+        pose = {"position": place, "wxyz": quaternion(turn)}
+        self._server.scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, **pose, **options)
 
 
 def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
@@ -159,7 +137,7 @@ def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
     return np.stack([centre - _METRES_PER_NEWTON * force, centre], 1)
 
 
-def box_faces(box: trimesh.Trimesh) -> list[tuple[tuple[int, int, int], trimesh.Trimesh]]:
+def box_faces(box: trimesh.Trimesh) -> list[tuple[Color, trimesh.Trimesh]]:
     """The six faces of a box, each with its colour of `FACES`: +x, -x, +y, -y, +z, -z."""
     axis = np.abs(box.face_normals).argmax(-1)
     side = 2 * axis + (box.face_normals[np.arange(len(axis)), axis] < 0)
@@ -168,6 +146,6 @@ def box_faces(box: trimesh.Trimesh) -> list[tuple[tuple[int, int, int], trimesh.
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a rotation matrix [3, 3]."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return trimesh.transformations.quaternion_from_matrix(matrix)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.asarray(rotation, float).ravel())
+    return quat

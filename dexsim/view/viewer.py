@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim.render.panel import FELT, Layout, draw_panel, make_layout, read_outs
+from dexsim.render.panel import FELT, Panel, read_outs
 from dexsim.view.scene import Scene
 from dexsim.view.source import Choice, Control, Frame, Slider, Source
 
@@ -40,7 +40,7 @@ class Viewer:
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
         self.scene = Scene(self.server, hand, source.task)
-        self._layout: Layout = make_layout(*_PANEL, hand.taxel_grid, hand.num_fingers)
+        self._panel = Panel(hand, *_PANEL)
         self._clicked: set[str] = set()
         self._handles: dict[str, Any] = {}
         self._controls: dict[str, Control] = {}
@@ -127,14 +127,4 @@ class Viewer:
         if "command" in self._handles and "command" in words:  # The force loop adds to what the user has set.
             words["command"] = f"{self._handles['command'].value:.2f}, with the force loop {words['command']}"
         self._text.content = "  \n".join(f"{name}: **{word}**" for name, word in words.items())
-        self._maps.image = draw_panel(
-            self._layout,
-            self.source.hand.finger_names,
-            np.asarray(snapshot.taxel_force),
-            np.asarray(snapshot.finger_force),
-            {},
-            float(snapshot.target_force) if snapshot.turns is None else np.nan,
-            self._taxel_range,
-            self._finger_range,
-            FELT,
-        )
+        self._maps.image = self._panel.draw(snapshot, self._taxel_range, self._finger_range, {}, FELT)

@@ -29,8 +29,6 @@ try:
 except ImportError as error:
     raise ImportError(f"dexsim.wrappers.gymnasium needs gymnasium: {install_line('gym')}") from error
 
-_RENDER_MODES = (None, "rgb_array")
-
 
 class GymVectorEnv(VectorEnv):
     """A batch of environments behind Gymnasium's vector interface; arrays are NumPy.
@@ -38,34 +36,27 @@ class GymVectorEnv(VectorEnv):
     Args:
       env: what `dexsim.make` returns.
       num_envs: environments side by side.
-      observation_group: "actor" or "critic".
       autoreset_mode: when a finished environment restarts. `SAME_STEP`: at once; `observation` is then the first of the
         new episode, and `info["final_obs"]` has the last of the old one. `NEXT_STEP`: in the step after, which ignores
         its action and earns nothing; Gymnasium's wrappers, such as `NormalizeObservation`, need this mode.
       render_mode: "rgb_array" for pictures by `render`; None for none.
 
     Raises:
-      ConfigError: no such group, autoreset mode or render mode.
+      ConfigError: another autoreset mode.
     """
 
     def __init__(
         self,
         env: Env,
         num_envs: int,
-        observation_group: str = "actor",
         *,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ):
-        for what, given, known in (
-            ("observation group", observation_group, tuple(env.observation_layout)),
-            ("autoreset mode", autoreset_mode, (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)),
-            ("render mode", render_mode, _RENDER_MODES),
-        ):
-            if given not in known:
-                raise ConfigError(f"no {what} {given!r}: choose from {', '.join(map(str, known))}")
-        self.env, self.num_envs, self.render_mode, self._group = env, num_envs, render_mode, observation_group
-        size = sum(field.size for field in env.observation_layout[observation_group])
+        if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+            raise ConfigError(f"{autoreset_mode}: choose AutoresetMode.SAME_STEP or NEXT_STEP")
+        self.env, self.num_envs, self.render_mode = env, num_envs, render_mode
+        size = sum(field.size for field in env.observation_layout["actor"])
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -108,12 +99,7 @@ class GymVectorEnv(VectorEnv):
           observation [num_envs, n], reward, terminated, truncated [num_envs], and `info`: empty, but in the mode
           `SAME_STEP`, where an episode ended, `final_obs` [num_envs, n] and `final_info` (return and length) with the
           masks `_final_obs`, `_final_info`.
-
-        Raises:
-          ConfigError: before the first reset.
         """
-        if self._state is None:
-            raise ConfigError("reset the environment before its first step")
         self._state, last = self._advance(self._state, np.asarray(actions, np.float32))
         seen, info = (last if self._same_step else self._state), dict[str, Any]()
         terminated, truncated = np.array(seen.terminated), np.array(seen.truncated)
@@ -140,16 +126,14 @@ class GymVectorEnv(VectorEnv):
         return jax.vmap(self.env.restart)(last, ended.terminated | ended.truncated), last
 
     def _observation(self, state: Any) -> np.ndarray:
-        return np.array(state.obs[self._group])
+        return np.array(state.obs["actor"])
 
 
 class GymEnv(gymnasium.Env):
     """A single environment; arguments as of `GymVectorEnv`."""
 
-    def __init__(self, env: Env, observation_group: str = "actor", *, render_mode: str | None = None):
-        self._batch = GymVectorEnv(
-            env, 1, observation_group, autoreset_mode=AutoresetMode.NEXT_STEP, render_mode=render_mode
-        )
+    def __init__(self, env: Env, *, render_mode: str | None = None):
+        self._batch = GymVectorEnv(env, 1, autoreset_mode=AutoresetMode.NEXT_STEP, render_mode=render_mode)
         self.observation_space = self._batch.single_observation_space
         self.action_space = self._batch.single_action_space
         self.metadata, self.render_mode = self._batch.metadata, render_mode

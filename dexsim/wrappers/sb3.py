@@ -25,8 +25,8 @@ class SB3VecEnv(VecEnv):
     They have no attributes of their own: `get_attr` and `env_method` answer for the whole batch.
     """
 
-    def __init__(self, env: Env, num_envs: int, observation_group: str = "actor", *, render_mode: str | None = None):
-        self._batch = GymVectorEnv(env, num_envs, observation_group, render_mode=render_mode)
+    def __init__(self, env: Env, num_envs: int, *, render_mode: str | None = None):
+        self._batch = GymVectorEnv(env, num_envs, render_mode=render_mode)
         super().__init__(num_envs, self._batch.single_observation_space, self._batch.single_action_space)
         self._actions = np.zeros(0)
 

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from dexsim import check_hand
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError
 from dexsim.hand.load import load_hand
 
 
@@ -44,8 +43,7 @@ def test_a_link_that_is_elsewhere_or_turned_is_named(folder, says):
         hand.body_rotation[-1] = hand.body_rotation[-1] @ Rotation.from_euler("x", 0.01).as_matrix()
     else:
         hand.body_position[-1, 0] += np.float32(0.001)
-    with pytest.raises(AssetError, match=f"right_hand_pinky_link2.* {says}"):
-        check_hand.check_kinematics(hand)
+    assert re.search(f"right_hand_pinky_link2.* {says}", check_hand.check_kinematics(hand))
 
 
 def test_hand_without_a_grasp_fails(folder, capsys):

@@ -7,6 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from random_readings import random_readings
 
 from dexsim import observation
 from dexsim.core.errors import ConfigError
@@ -28,31 +29,9 @@ TIPS = ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip")
 observe = jax.jit(observation.observe, static_argnums=(0, 2, 3))
 
 
-def unit(rng):
-    quat = rng.normal(size=4)
-    return quat / np.linalg.norm(quat)
-
-
 @pytest.fixture(scope="module")
 def readings(hand):
-    """One tick in which every number is different; the ring finger touches nothing."""
-    rng = np.random.default_rng(0)
-    force = rng.uniform(0.1, 2, (5, 120)) * (rng.random((5, 120)) < 0.1)
-    force[3] = 0
-    values = Readings(
-        joint_position=rng.uniform(hand.joint_lower, hand.joint_upper),
-        joint_torque=rng.uniform(-1, 1, 12),
-        taxel_force=force,
-        object_position=rng.normal(size=3),
-        object_velocity=rng.normal(size=3),
-        object_quat=unit(rng),
-        goal_quat=unit(rng),
-        command=np.array(0.37),
-        last_action=rng.uniform(-1, 1, 12),
-        past_actions=rng.uniform(-1, 1, (2, 12)),
-        palm_gravity=unit(rng)[:3],
-    )
-    return jax.tree.map(lambda x: np.asarray(x, np.float32), values)
+    return random_readings(hand, 0)
 
 
 @pytest.fixture(scope="module")

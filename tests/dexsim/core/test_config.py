@@ -46,10 +46,9 @@ def message(build, *arguments, **keywords):
 
 REFUSED = [
     (dict(stiffness=9.0), "Spring.stiffness = 9 N/m: must be between 0.5 and 8 N/m"),
-    (dict(turns=0), "Spring.turns = 0: must be at least 1"),
-    (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
+    (dict(turns=0), "Spring.turns = 0: must be between 1 and inf"),
+    (dict(rest=0.2), "Spring.rest = 0.2 m: must be between -inf and 0.1 m"),
     (dict(stiffness="2"), "Spring.stiffness = '2': expected float"),
-    (dict(turns=10**30), "Spring.turns = 1e+30: must be at most 9.223372037e+18"),
     (dict(turns=3.0), "Spring.turns = 3.0: expected int"),
     (dict(turns=True), "Spring.turns = True: expected int"),
     (dict(span=1.0), "Spring.span = 1.0: expected a list"),

@@ -1,7 +1,8 @@
-"""Signed distances against the nearest point of a densely searched surface."""
+"""Signed distances against C MuJoCo's, of a small ball from a geom."""
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -14,67 +15,23 @@ SIZES = {
     "capsule": (0.013, 0.022, 0),
     "cylinder": (0.024, 0.017, 0),
 }
-
-
-# --- an independent reference: the surface in patches, float64 -----------------------------------
-
-
-def radial(points, radius, height):
-    """Points at this distance from the z axis, in the direction in which `points` lie."""
-    across = points[:, :2] / np.maximum(np.linalg.norm(points[:, :2], axis=1, keepdims=True), 1e-300)
-    across = np.where(np.linalg.norm(across, axis=1, keepdims=True) > 0.5, across, [1.0, 0.0])
-    return np.column_stack([across * np.reshape(radius, (-1, 1)), np.broadcast_to(height, len(points))])
-
-
-def ball(points, centre, radius):
-    seen = points - centre
-    length = np.linalg.norm(seen, axis=1, keepdims=True)
-    out = [0.0, 0.0, -1.0 if centre[2] < 0 else 1.0]
-    return centre + radius * np.where(length > 0, seen / np.maximum(length, 1e-300), out)
-
-
-def nearest_point(kind, size, points):
-    """The nearest point [P, 3] of the surface: of the nearest points of each of its patches, the nearest."""
-    a, b, _ = (float(s) for s in size)
-    across = np.linalg.norm(points[:, :2], axis=1)
-    if kind == "sphere":
-        patches = [ball(points, np.zeros(3), a)]
-    elif kind == "box":
-        patches = []
-        for axis in range(3):
-            for side in (-1, 1):
-                face = np.clip(points, -np.asarray(size, float), size)
-                face[:, axis] = side * size[axis]
-                patches.append(face)
-    elif kind == "cylinder":
-        patches = [
-            radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b)),
-            radial(points, np.minimum(across, a), b),
-            radial(points, np.minimum(across, a), -b),
-        ]
-    else:  # capsule; beyond the tube's ends only the half of a ball that looks outwards is surface
-        patches = [radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b))]
-        for side in (-1, 1):
-            cap = ball(points, np.array([0, 0, side * b]), a)
-            patches.append(np.where(side * cap[:, 2:] >= b, cap, np.inf))
-    gap = np.linalg.norm(points - np.array(patches), axis=-1)
-    return np.array(patches)[gap.argmin(0), np.arange(len(points))]
-
-
-def is_inside(kind, size, points):
-    a, b, _ = size
-    across, z = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
-    return {
-        "sphere": lambda: np.hypot(across, z) < a,
-        "box": lambda: np.all(np.abs(points) < size, axis=1),
-        "cylinder": lambda: (across < a) & (z < b),
-        "capsule": lambda: np.hypot(across, np.maximum(z - b, 0)) < a,
-    }[kind]()
+BALL = 1e-4  # m
 
 
 def reference(kind, size, points):
-    gap = np.linalg.norm(points - nearest_point(kind, size, points), axis=-1)
-    return np.where(is_inside(kind, size, points), -gap, gap)
+    """Distance [P] of points [P, 3], and the way [P, 3] from the nearest surface point, in C MuJoCo."""
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=size)
+    probe = spec.worldbody.add_body(mocap=True)
+    probe.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[BALL, 0, 0])
+    model = spec.compile()
+    data, found, segment = mujoco.MjData(model), [], np.zeros(6)
+    for point in points:
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(model, data)
+        distance = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, segment) + BALL
+        found.append([distance, *(segment[3:] - segment[:3])])
+    return np.array(found)[:, 0], np.array(found)[:, 1:]
 
 
 def probes(size, count=150, seed=0):
@@ -118,24 +75,16 @@ distance_and_normal = jax.jit(sdf.distance_and_normal)
 
 
 @pytest.mark.parametrize(("kind", "size"), SIZES.items())
-def test_distance_to_the_nearest_surface_point(kind, size):
+def test_distance_and_outward_normal(kind, size):
     points = probes(size)
-    wanted = reference(kind, size, points.astype(float))
+    wanted, way = reference(kind, size, points.astype(float))
     assert (wanted < -1e-3).sum() > 10 and (wanted > 1e-3).sum() > 10
-    np.testing.assert_allclose(distance(points, one(kind, size)), wanted, atol=2e-6)
-
-
-@pytest.mark.parametrize("kind", sdf.KINDS)
-def test_normals_are_unit_and_point_from_the_nearest_point(kind):
-    points = probes(SIZES[kind], seed=2).astype(float)
-    nearest = nearest_point(kind, SIZES[kind], points)
-    gap = np.linalg.norm(points - nearest, axis=1, keepdims=True)
-    _, normal = distance_and_normal(points.astype(np.float32), one(kind, SIZES[kind]))
-    outside = ~is_inside(kind, SIZES[kind], points)
-    far = outside & (gap[:, 0] > 1e-3)
-    assert far.sum() > 50
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1)[outside], 1.0, atol=1e-5)
-    np.testing.assert_allclose(np.asarray(normal)[far], ((points - nearest) / gap)[far], atol=2e-3)
+    found, normal = distance_and_normal(points, one(kind, size))
+    np.testing.assert_allclose(found, wanted, atol=2e-6)
+    np.testing.assert_allclose(distance(points, one(kind, size)), found, atol=1e-7)
+    far = wanted > 1e-3
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1)[wanted > 0], 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(normal)[far], (way / np.linalg.norm(way, axis=1)[:, None])[far], atol=2e-3)
 
 
 @pytest.mark.parametrize("kind", sdf.KINDS)
@@ -176,7 +125,7 @@ def test_a_union_is_the_nearest_of_its_primitives(seed):
     kinds, size, position, rotation, shape = posed_union(seed)
     probe = np.random.default_rng(seed + 10).uniform(-0.09, 0.09, (400, 3)).astype(np.float32)
     wanted = np.min(
-        [reference(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)], axis=0
+        [reference(kind, size[k], (probe - position[k]) @ rotation[k])[0] for k, kind in enumerate(kinds)], axis=0
     )
     assert (wanted < 0).sum() > 3
     np.testing.assert_allclose(distance(probe, shape), wanted, atol=1e-5)

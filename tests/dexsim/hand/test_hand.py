@@ -1,4 +1,4 @@
-"""The hand: published kinematics and taxels; C MuJoCo; broken files."""
+"""The shipped hands: published kinematics and taxels; C MuJoCo; broken files."""
 
 import shutil
 
@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from dexsim import check_hand
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
@@ -109,17 +110,44 @@ def test_taxels_are_the_published_lattice(hand, finger):
         )
 
 
-def test_taxels_lie_on_the_collision_pads(hand):
-    """Solver and taxels must feel one surface: 0.3 mm rms apart, and nowhere 1.2 mm."""
-    for finger in range(5):
-        gap = np.full(120, np.inf)
-        for geom in hand.geoms:
-            if geom.body == hand.tip_body[finger] and geom.touches:
-                assert geom.kind == "capsule"
-                local = (hand.taxel_position[finger] - geom.position) @ geom.rotation
-                local[:, 2] -= np.clip(local[:, 2], -geom.size[1], geom.size[1])
-                gap = np.minimum(gap, np.linalg.norm(local, axis=1) - geom.size[0])
-        assert np.sqrt(np.mean(gap**2)) < 5e-4 and np.abs(gap).max() < 2e-3, hand.finger_names[finger]
+# --- the example hands ---------------------------------------------------------------------------
+
+# Tips (m, palm frame) by finger with all motors at 0 and at 0.4 rad, multiplied out from the published chains: LEAP
+# Hand of MuJoCo Menagerie (right_hand.xml; ends of its fingertip meshes), Inspire RH56 of dexsuite/dex-urdf.
+TIPS = {
+    "leap_like": {
+        "thumb": [(0.0215, 0.1387, -0.0823), (0.0897, 0.0975, -0.0246)],
+        "index": [(0.0195, 0.0080, 0.1322), (0.1100, -0.0243, 0.0786)],
+        "middle": [(0.0195, -0.0374, 0.1321), (0.1100, -0.0697, 0.0785)],
+        "ring": [(0.0195, -0.0828, 0.1321), (0.1100, -0.1151, 0.0786)],
+    },
+    "inspire_like": {
+        "thumb": [(0.0438, 0.1127, 0.1186), (0.0402, 0.0490, 0.1551)],
+        "index": [(0.0011, 0.0290, 0.2137), (0.0468, 0.0284, 0.1966)],
+        "middle": [(0.0010, 0.0069, 0.2171), (0.0489, 0.0069, 0.1991)],
+        "ring": [(0.0009, -0.0163, 0.2135), (0.0466, -0.0154, 0.1965)],
+        "pinky": [(0.0013, -0.0387, 0.2037), (0.0410, -0.0371, 0.1891)],
+    },
+}
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_tips_are_where_the_published_chains_put_them(name):
+    hand = load_hand(name)
+    kinematics = jax.jit(lambda joints: forward_kinematics(hand, joints).tip_position)
+    for row, angle in enumerate((0.0, 0.4)):
+        tips = kinematics(np.full(hand.num_joints, angle, np.float32))
+        wanted = [TIPS[name][finger][row] for finger in hand.finger_names]
+        np.testing.assert_allclose(tips, wanted, atol=6e-4)  # places are rounded to 0.1 mm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TIPS)
+def test_passes_the_checks(name, capsys):
+    assert check_hand.main([name]) == 0
+    out = capsys.readouterr().out
+    assert out.count("ok  ") == 9 and "pairs" in out
+    assert ("index_intermediate (x 1.064)" in out) == (name == "inspire_like")
 
 
 # --- files ---------------------------------------------------------------------------------------
@@ -128,8 +156,9 @@ def test_taxels_lie_on_the_collision_pads(hand):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working directory
-    for name in ("xhand_right.xml", "xhand_right.toml", "taxels.csv"):
-        shutil.copy(asset_path(f"hand/{name}"), tmp_path / name)
+    for name in ("xhand_right.xml", "xhand_right.toml", "taxels.csv", "leap_like/leap_like.toml"):
+        shutil.copy(asset_path(f"hand/{name}"), tmp_path)
+    shutil.copy(asset_path("hand/leap_like/leap_like.xml"), tmp_path)
     return tmp_path
 
 
@@ -149,12 +178,16 @@ BROKEN = {
     "slide joint": ("xml", BEND, f'type="slide" {BEND}', "hinge"),
     "no range": ("xml", BEND, 'axis="-1 0 0" range="0 0" limited="false" actuatorfrcrange="-1 1"', "index_bend"),
     "no torque limit": ("xml", BEND, 'axis="-1 0 0" range="-0.174 0.174"', "actuatorfrcrange"),
-    "unknown joint": ("toml", '"index_bend",', '"index_bent",', "no joint 'index_bent'"),
+    "unknown joint": ("toml", '"index_bend",', '"index_bent",', "Invalid name 'index_bent'"),
     "root joint of another finger": ("toml", 'root_joint = "mid_joint1"', 'root_joint = "ring_joint1"', "not move"),
+    "included file": ("xml", "<worldbody>", "<include file='taxels.xml'/><worldbody>", "<include> is not supported"),
     "misspelt entry": ("toml", "palm = ", "taxel_pich = 1\npalm = ", "'taxel_pich'"),
     "posture in degrees": ("toml", "posture = [1.45", "posture = [83", "83 rad of 'thumb_bend'"),
     "column outside": ("csv", "thumb,0,1,", "thumb,10,1,", ":3: column 10"),
     "not a number": ("csv", "thumb,0,1,-0.01500", "thumb,0,1,nan", "'thumb' has 119"),
+    "no pitch of a lattice": ("leap", "taxel_pitch = [0.0035, 0.0035]\n", "", "either taxels"),
+    "no such pad": ("leap", 'pad = "index_pad"', 'pad = "palm"', "finger 'index': pad = 'palm'"),
+    "along the pad": ("leap", "facing = [0, 0, 1]", "facing = [0, 1, 0]", "across the pad 'thumb_pad'"),
     "normal of length zero": ("csv", "-0.97944,-0.04477,0.19669", "0,0,0", ":2: the normal"),
 }
 
@@ -162,11 +195,11 @@ BROKEN = {
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_file_is_an_error_that_names_it(folder, case):
     kind, old, new, word = BROKEN[case]
-    path = folder / ("taxels.csv" if kind == "csv" else f"xhand_right.{kind}")
+    path = folder / {"csv": "taxels.csv", "leap": "leap_like.toml"}.get(kind, f"xhand_right.{kind}")
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(AssetError) as caught:
-        load_hand(folder / "xhand_right.toml")
+        load_hand(folder / ("leap_like.toml" if kind == "leap" else "xhand_right.toml"))
     message = str(caught.value)
     assert "\n" not in message and str(folder) in message and word in message, message

@@ -39,20 +39,6 @@ def test_default_hand_has_no_record(hand):
         load_hand("nohand")
 
 
-def test_the_hash_has_what_the_included_files_include(own):
-    """MuJoCo finds those beside the model, or beside the file that includes them."""
-    own = Path(own).resolve()  # MuJoCo misses the file of a file where the model's path is relative
-    folder = own.parent
-    (folder / "parts").mkdir()
-    replace(folder / "xhand_right.xml", "<worldbody>", "<include file='parts/a.xml'/><worldbody>")
-    for place in (folder / "parts/b.xml", folder / "b.xml"):
-        (folder / "parts/a.xml").write_text("<mujoco><include file='b.xml'/></mujoco>")
-        place.write_text("<mujoco><custom><numeric name='x' data='1'/></custom></mujoco>")
-        before = load_hand(own).digest
-        place.write_text("<mujoco><custom><numeric name='x' data='2'/></custom></mujoco>")
-        assert load_hand(own).digest != before
-
-
 def test_policy_carries_its_hand(own, tmp_path):
     record = record_of(load_hand(own))
     dataclasses.replace(load_policy("grasp"), hand=record).save("policy.msgpack")

@@ -1,64 +1,87 @@
 """Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
 
+import dataclasses
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from shapes import solid
 
-from dexsim.core.errors import AssetError
+from dexsim.check_hand import check_taxels
 from dexsim.geometry import sdf
-from dexsim.hand import layout
+from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
+from dexsim.hand.load import load_hand
 
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])
 def test_neighbours_are_a_pitch_apart(kind):
-    points = layout.lattice(9, 8, pitch=0.002, kind=kind)
-    flat = np.stack([points.u, points.v], -1)
+    taxels = lay_taxels("plane", (9, 8), pitch=0.002, kind=kind)
+    flat = taxels[:, :2]
     gap = cKDTree(flat).query(flat, k=7)[0][:, 1:]
     np.testing.assert_allclose(gap[:, 0], 0.002, rtol=1e-9)
     neighbours = np.sum(np.isclose(gap, 0.002), 1)
     assert neighbours.max() == (6 if kind == "hex" else 4)
     np.testing.assert_allclose(flat.mean(0), 0, atol=1e-12)
     # A cell's area: the hexagon of that pitch, or the square.
-    assert points.cell == pytest.approx(0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
+    np.testing.assert_allclose(taxels[:, 6], 0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
 
 
 @pytest.mark.parametrize(
     ("kind", "sizes", "shape"),
     [
-        ("plane", {}, None),
         ("cylinder", {"radius": 0.008}, solid("cylinder", 0.008, 0.1)),
         ("capsule", {"radius": 0.008, "half_length": 0.006}, solid("capsule", 0.008, 0.006)),
         ("sphere", {"radius": 0.012}, solid("sphere", 0.012)),
     ],
 )
-def test_patches_lie_on_their_surface(kind, sizes, shape):
-    patch = layout.on_surface(kind, layout.lattice(7, 9, pitch=0.002), **sizes)
-    np.testing.assert_allclose(np.linalg.norm(patch.normal, axis=1), 1, rtol=1e-12)
-    if shape is None:
-        np.testing.assert_array_equal(patch.position[:, 2], 0)
-        return
-    above = patch.position + 1e-5 * patch.normal
-    distance, normal = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), shape)
+def test_taxels_lie_on_their_surface_wherever_it_is(kind, sizes, shape):
+    taxels = lay_taxels(kind, (7, 9), pitch=0.002, **sizes)
+    position, normal = taxels[:, :3], taxels[:, 3:6]
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-12)
+    above = position + 1e-5 * normal
+    distance, away = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), shape)
     np.testing.assert_allclose(distance, 1e-5, atol=1e-8)
-    np.testing.assert_allclose(normal, patch.normal, atol=1e-5)
+    np.testing.assert_allclose(away, normal, atol=1e-5)
     # Rows keep their pitch in arc length everywhere, columns on the straight part.
-    grid = patch.position.reshape(7, 9, 3)
-    middle = grid[3]
-    radius = sizes["radius"]
-    chord = np.linalg.norm(np.diff(middle, axis=0), axis=1)
+    place, radius = position.reshape(7, 9, 3), sizes["radius"]
+    chord = np.linalg.norm(np.diff(place[3], axis=0), axis=1)
     assert np.all((chord > 2 * radius * np.sin(0.001 / radius) - 1e-9) & (chord < 0.002 + 1e-9))
-    across = np.linalg.norm(np.diff(grid[:, 4], axis=0), axis=1)
+    across = np.linalg.norm(np.diff(place[:, 4], axis=0), axis=1)
     np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
+    turn = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()
+    moved = lay_taxels(kind, (7, 9), pitch=0.002, **sizes, position=(0.1, 0, 0), rotation=turn)
+    np.testing.assert_allclose((moved[:, :3] - [0.1, 0, 0]) @ turn, position, atol=1e-12)
+    np.testing.assert_allclose(moved[:, 3:6] @ turn, normal, atol=1e-12)
 
 
-def test_taxels_inside_the_link_are_refused(hand):
-    layout.check_hand(hand)
-    finger = solid("capsule", 0.008, 0.006)
-    patch = layout.on_surface("capsule", layout.lattice(5, 6, pitch=0.002), radius=0.008, half_length=0.006)
-    layout.check_outside(patch, finger)
-    sunk = layout.placed(patch, position=(-0.002, 0, 0))
-    words = r"^tip: taxel column \d, row \d lies 2(\.0)? mm inside its link \(\d+ of 30\)$"
-    with pytest.raises(AssetError, match=words):
-        layout.check_outside(sunk, finger, name="tip")
+def test_a_written_layout_is_read_back(tmp_path):
+    taxels = lay_taxels("sphere", (4, 3), pitch=0.002, radius=0.01)
+    path = write_layout(tmp_path / "taxels.csv", {"a": taxels, "b": taxels[::-1]}, (4, 3))
+    np.testing.assert_allclose(read_taxels(path, ("b", "a"), (4, 3)), [taxels[::-1], taxels], atol=1e-6)
+
+
+def test_a_sunk_taxel_is_named(hand):
+    sunk = dataclasses.replace(hand, taxel_position=hand.taxel_position.copy())
+    sunk.taxel_position[1, 17] -= 0.004 * sunk.taxel_normal[1, 17]
+    assert not check_taxels(hand)
+    where = r"^finger 'index': taxel column 1, row 5 lies [34](\.\d)? mm inside its link \(1 of 120\)$"
+    assert re.search(where, check_taxels(sunk))
+
+
+def test_taxels_of_a_pad_are_on_it_and_face_as_told():
+    hand = load_hand("leap_like")
+    assert hand.taxel_position.shape == (4, 48, 3)
+    for finger, facing in enumerate([(0, 0, 1), (1, 0, 0), (1, 0, 0), (1, 0, 0)]):
+        pad = next(g for g in hand.geoms if g.name == f"{hand.finger_names[finger]}_pad")
+        local = (hand.taxel_position[finger] - pad.position) @ pad.rotation
+        axis = np.clip(local[:, 2], -pad.size[1], pad.size[1])
+        out = local - axis[:, None] * [0, 0, 1]
+        np.testing.assert_allclose(np.linalg.norm(out, axis=1), pad.size[0], atol=1e-6)
+        np.testing.assert_allclose(hand.taxel_normal[finger] @ pad.rotation, out / pad.size[0], atol=1e-4)
+        middle = hand.taxel_normal[finger].mean(0)
+        assert middle @ facing / np.linalg.norm(middle) > 0.999
+        # 6 x 8 cells of 3.5 mm, of which those over the round end are smaller.
+        assert 0.95 < hand.taxel_area[finger].sum() / (48 * 0.0035**2) <= 1 + 1e-6

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_readings import random_readings
 
 from dexsim import import_hand
 from dexsim.core.assets import asset_path
@@ -18,11 +19,10 @@ from dexsim.geometry import rotations
 from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR, QUAT
 from dexsim.hand import mirror
 from dexsim.hand.description import Hand
-from dexsim.hand.files import find_hand
 from dexsim.hand.kinematics import forward_kinematics
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import is_mirror_image, mirror_hand, mirror_mjcf, swap_sides, write_mirror
-from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, Readings, mirror_readings, observe
+from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, mirror_readings, observe
 
 HANDS = ("xhand_right", "leap_like", "inspire_like")
 
@@ -98,7 +98,7 @@ def test_a_mirror_image_moves_in_the_mirror_and_mirrored_twice_is_the_hand(tmp_p
 MODEL = """
 <mujoco model="right_parts">
   <compiler meshdir="../meshes" eulerseq="zYx"/>
-  <include file="parts/defaults.xml"/>
+  <default><default class="bent"><joint axis="0.2 1 0.3"/></default></default>
   <asset><mesh file="right_Wedge.obj"/></asset>
   <worldbody>
     <light pos="1 2 3" dir="0.1 0.2 -1"/>
@@ -123,19 +123,15 @@ MODEL = """
 
 
 def test_every_way_to_write_an_mjcf_is_mirrored(tmp_path):
-    """Orientations, frames, defaults, an included file and a mesh: masses, inertias and poses in C MuJoCo."""
+    """Orientations, frames, defaults and a mesh: masses, inertias and poses in C MuJoCo."""
     folder = tmp_path / "model"
-    (folder / "parts").mkdir(parents=True)
+    folder.mkdir()
     (tmp_path / "meshes").mkdir()
     (folder / "right.xml").write_text(MODEL)
-    (folder / "parts/defaults.xml").write_text(
-        '<mujoco><default><default class="bent"><joint axis="0.2 1 0.3"/></default></default></mujoco>'
-    )
     (tmp_path / "meshes/right_Wedge.obj").write_text(
         "v 0 0 0\nv .03 0 0\nv 0 .02 0\nv 0 .01 .04\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
     model = ElementTree.parse(folder / "right.xml").getroot()
-    mirror._paste_includes(model, folder, folder)
     for name, source in dict(mirror._gather_files(model, folder)).items():
         shutil.copyfile(source, tmp_path / name)
     mirror_mjcf(model)
@@ -165,35 +161,10 @@ def test_an_existing_hand_is_not_overwritten(tmp_path):
         write_mirror(find_hand(None), tmp_path)
 
 
-NUMBERS = st.lists(st.floats(-1, 1, width=32), min_size=20, max_size=20)
-
-
-def readings_of(hand: Hand, numbers: list[float]) -> Readings:
-    """Readings with these numbers in them."""
-    values = np.array(numbers, np.float32)
-    quats = values[:8].reshape(2, 4) + np.array([1.5, 0, 0, 0], np.float32)
-    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
-    taxels = np.maximum(np.resize(values, hand.taxel_area.shape), 0).astype(np.float32)
-    joints = np.resize(values, hand.num_joints).astype(np.float32)
-    return Readings(
-        joint_position=(hand.joint_lower + hand.joint_upper) / 2 + 0.1 * joints,
-        joint_torque=joints,
-        taxel_force=taxels,
-        object_position=values[8:11],
-        object_velocity=values[11:14],
-        object_quat=quats[0],
-        goal_quat=quats[1],
-        command=np.float32(0.5),
-        last_action=joints,
-        past_actions=np.stack([joints, -joints]),
-        palm_gravity=values[14:17],
-    )
-
-
 @settings(max_examples=30, deadline=None)
-@given(NUMBERS)
-def test_readings_are_mirrored_as_rotations_and_vectors_are(hand, numbers):
-    readings = readings_of(hand, numbers)
+@given(st.integers(0, 2**31))
+def test_readings_are_mirrored_as_rotations_and_vectors_are(hand, seed):
+    readings = random_readings(hand, seed)
     image = mirror_readings(readings)
     for name, value in vars(mirror_readings(image)).items():
         np.testing.assert_array_equal(value, getattr(readings, name), err_msg=name)
@@ -208,7 +179,7 @@ def test_readings_are_mirrored_as_rotations_and_vectors_are(hand, numbers):
 @pytest.mark.parametrize("names", [GRASP, (*ROTATE_CRITIC, "palm_gravity", "past_actions", "finger_force")])
 def test_a_policy_sees_the_right_hand(hand, left, names):
     """The left hand's own readings: taxels in its own order."""
-    readings = readings_of(hand, list(np.random.default_rng(1).uniform(-1, 1, 20)))
+    readings = random_readings(hand, 1)
     motion = Motion(readings.joint_torque, readings.object_velocity)
     order = [
         np.abs(p[:, None] - q * POLAR).max(-1).argmin(0)

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.hand.files import find_hand
 from dexsim.hand.kinematics import forward_kinematics
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import find_hand, load_hand
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig

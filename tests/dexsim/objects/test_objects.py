@@ -146,6 +146,3 @@ def test_extent_is_the_bound_of_the_turned_shape():
         shape = dataclasses.replace(one.shape(), position=one.position @ turn.T, rotation=np.stack([turn] * 3))
         reach = [extent(one.size, one.position, one.active, sign * turn[2]) for sign in (-1, 1)]
         np.testing.assert_allclose([-reach[0], reach[1]], bounds(shape)[:, 2], atol=1e-6)
-
-
-# --- the contact's damping -----------------------------------------------------------------------------

@@ -33,7 +33,7 @@ def primitives(*entries):
     """(kind, size, position) of each, unturned."""
     kind, size, position = zip(*entries, strict=True)
     turn = np.tile(np.eye(3), (len(kind), 1, 1))
-    color = np.full((len(kind), 3), 0.5, np.float32)
+    color = np.full((len(kind), 6, 3), 0.5, np.float32)
     return Primitives(kind, np.asarray(size, np.float64), np.asarray(position, np.float64), turn, color)
 
 
@@ -177,7 +177,7 @@ import dexsim.render.render
 from dexsim.render.camera import Camera, look
 from dexsim.render.picture import Primitives, cast
 assert not {"matplotlib", "PIL"} & set(sys.modules)
-ball = Primitives(("sphere",), np.full((1, 3), 0.1), np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
+ball = Primitives(("sphere",), np.full((1, 3), 0.1), np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 6, 3)))
 view = look(Camera(), (8, 8))
 assert (cast(ball, view, view.rays()).primitive == 0).any()
 from dexsim.render.panel import force_color

@@ -16,7 +16,7 @@ import pytest
 from dexsim.core.assets import asset_path
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
-from dexsim.render.picture import Pose, hand_poses
+from dexsim.render.picture import hand_poses
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
 from dexsim.view.simulation import NONE, PolicyShelf, Simulation
@@ -29,13 +29,7 @@ VALUES = {"policy": "grasp", "object": "any", "command": 0.5, "friction factor":
 
 
 def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
-    links = forward_kinematics(hand, np.full(hand.num_joints, 0.3, np.float32))
-    pose = Pose(
-        *map(
-            np.asarray,
-            (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links)),
-        )
-    )
+    (pose,) = hand_poses(hand, np.full((1, hand.num_joints), 0.3))
     force = np.zeros((5, 120))
     force[2, 17] = 2.0
     ((tail, head),) = force_arrows(pose, force)

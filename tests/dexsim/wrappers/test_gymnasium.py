@@ -120,16 +120,6 @@ def test_a_learner_in_the_manner_of_cleanrl_learns_through_gymnasiums_wrappers()
     assert returns[:64].mean() < 20 < 28 < returns[-64:].mean(), "of 31.2 at best"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"observation_group": "eyes"}, "no observation group .eyes.: choose from actor"),
-        ({"autoreset_mode": AutoresetMode.DISABLED}, "no autoreset mode .*: choose from .*SAME_STEP"),
-        ({"render_mode": "human"}, "no render mode .human.: choose from None, rgb_array"),
-    ],
-)
-def test_what_does_not_fit_is_one_line(arguments, message):
-    with pytest.raises(ConfigError, match=message):
-        GymVectorEnv(TinyEnv(), 2, **arguments)
-    with pytest.raises(ConfigError, match="reset the environment before"):
-        GymVectorEnv(TinyEnv(), 1).step(np.zeros((1, 1)))
+def test_a_mode_without_restarts_is_an_error():
+    with pytest.raises(ConfigError, match="DISABLED.*: choose AutoresetMode.SAME_STEP or NEXT_STEP"):
+        GymVectorEnv(TinyEnv(), 2, autoreset_mode=AutoresetMode.DISABLED)
