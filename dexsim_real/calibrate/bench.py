@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from rich.console import Console
 
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
@@ -40,18 +39,18 @@ class Operator:
     """The person beside the hand.
 
     Args:
-      console: for output.
+      out: for output.
       assume_yes: ask nothing and assume that every answer is yes.
       stream: of the answers; None is the standard input.
     """
 
-    def __init__(self, console: Console, *, assume_yes: bool = False, stream: TextIO | None = None):
-        self.console, self.assume_yes = console, assume_yes
+    def __init__(self, out: TextIO, *, assume_yes: bool = False, stream: TextIO | None = None):
+        self.out, self.assume_yes = out, assume_yes
         self._stream = stream or sys.stdin or io.StringIO()  # Python has no `sys.stdin` where it was closed.
 
     def tell(self, text: str) -> None:
         """Print one line."""
-        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print(text, file=self.out, flush=True)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.

@@ -5,8 +5,8 @@ a later one give the same result.
 """
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -74,17 +74,17 @@ class PressProcedure:
         Raises:
           HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
         """
-        record = {"placement": dataclasses.asdict(placement)}
-        for attempt in itertools.count(1):
+        record, attempts = {"placement": dataclasses.asdict(placement)}, 0
+        while True:
             self.bench.log.add(Kind.META, record)
             try:
                 return self._press(placement)
             except MissedPress as missed:
+                attempts += 1
                 self.bench.log.add(Kind.META, record)  # Drops what was recorded of it.
-                if self.operator.assume_yes and attempt >= _ATTEMPTS:
+                if self.operator.assume_yes and attempts >= _ATTEMPTS:
                     raise
                 self.operator.tell(f"  {missed}; again")
-        raise AssertionError("the attempts have no end")
 
     def _press(self, placement: Placement) -> bool:
         self._placement = placement
@@ -128,48 +128,40 @@ class PressProcedure:
     def _approach(self) -> None:
         """Advance until contact, where the advance is set to zero."""
         name = self._placement.name
-        while True:
-            exchange = self._step(self.config.approach_speed)
+        for exchange in self._advancing(self.config.approach_speed):
             if exchange is None:
                 continue
             if self._force(exchange) >= self._touch:
-                break
+                self._base, self._advance = self._target(), 0.0
+                return
             if self._overloaded(exchange):
                 raise MissedPress(
                     f"{name}: {exchange.sample.measured.current.max():.2f} A and no taxel feels it; press on the "
                     "taxels, and check that their sensor is connected"
                 )
-            if self._advance >= _TRAVEL:
-                raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
-        self._base, self._advance = self._target(), 0.0
+        raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
 
     def _load(self, speed: float) -> None:
         """Press until peak force, current or travel is reached, or the motors stall."""
         assert self.bench.safety.sample is not None, "the approach has read the pose"
         begin, first = self.bench.safety.sample.measured.joint_position.astype(float), self._target()
         second = round(self.bench.arguments.rate)
-        forces: list[float] = []
-        positions: list[np.ndarray] = []
-        while True:
-            exchange = self._step(speed, LOADING)
+        forces, positions = list[float](), list[np.ndarray]()
+        for exchange in self._advancing(speed, LOADING):
             if exchange is None:
                 forces.clear()  # After an interruption a constant force does not mean that the motors stall.
                 continue
             forces.append(self._force(exchange))
             positions.append(exchange.sample.measured.joint_position.astype(float))
-            if forces[-1] >= self.config.peak or self._overloaded(exchange):
+            before = np.mean(forces[-second - _LAST : -second]) if len(forces) > 2 * second else -np.inf
+            ended = forces[-1] >= self.config.peak or self._overloaded(exchange)
+            if ended or np.mean(forces[-_LAST:]) - before < _STALL * self.config.peak:
                 break
-            stalled = (
-                len(forces) > 2 * second
-                and np.mean(forces[-_LAST:]) - np.mean(forces[-second - _LAST : -second]) < _STALL * self.config.peak
+        if not ended and forces[-1] < 4 * self._touch:
+            raise MissedPress(
+                f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something firmer, or raise "
+                "--hardware.torque-max"
             )
-            if self._advance >= _TRAVEL or stalled:
-                if forces[-1] < 4 * self._touch:
-                    raise MissedPress(
-                        f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something "
-                        "firmer, or raise --hardware.torque-max"
-                    )
-                break
         self._held = (self._target() - first, np.mean(positions[-_LAST:], 0) - begin)
 
     def _aim(self, lean: float) -> None:
@@ -200,14 +192,18 @@ class PressProcedure:
 
     def _seek(self, force: float, speed: float, phase: str = "") -> None:
         """Advance or retract until the force is passed, or a limit is reached."""
-        end = _TRAVEL if speed > 0 else -_CLEARANCE
-        while (end - self._advance) * speed > 0:
-            exchange = self._step(speed, phase)
+        for exchange in self._advancing(speed, phase):
             if exchange is None:
                 continue
             over = (self._force(exchange) - force) * math.copysign(1.0, speed)
             if over >= 0 or (speed > 0 and self._overloaded(exchange)):
                 return
+
+    def _advancing(self, speed: float, phase: str = "") -> Iterator[Exchange | None]:
+        """Steps until the end of the travel."""
+        end = _TRAVEL if speed > 0 else -_CLEARANCE
+        while (end - self._advance) * speed > 0:
+            yield self._step(speed, phase)
 
     def _back_off(self) -> None:
         """Free the fingertip, and check that it does not read far below zero: it was touched when it was tared."""

@@ -2,7 +2,7 @@
 
 The IMU sends 100 RVC frames a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01 degree, three
 accelerations in mg, three more bytes, and the sum of all bytes after the head (BNO080 datasheet, 1.3.5.2). Yaw has no
-absolute reference and the palm may lean, so a known pose of the object aligns both (`align`). Yaw, pitch and roll are
+absolute reference and the palm may lean, so a known pose of the object aligns both. Yaw, pitch and roll are
 singular where the IMU's x points up or down: mount it with its z along the axis that stays upright. `UPRIGHT_X` is the
 mount in an object that turns about its x.
 """
@@ -12,6 +12,7 @@ import struct
 import threading
 import time
 
+import mujoco
 import numpy as np
 
 from dexsim.core.install import install_line
@@ -57,16 +58,9 @@ def decode(frame: bytes) -> np.ndarray | None:
     _, yaw, pitch, roll, *_ = _BODY.unpack(body)
     if abs(yaw) > 18000 or abs(pitch) > 9000 or abs(roll) > 18000:
         return None
-    half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
-    (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    quat = np.empty(4)
+    mujoco.mju_euler2Quat(quat, np.radians([yaw, pitch, roll]) / 100, "zyx")
+    return quat
 
 
 class RvcParser:
@@ -102,18 +96,12 @@ def conjugate(a: np.ndarray) -> np.ndarray:
     return a * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The rotation [4] from the IMU's world frame to the palm frame.
-
-    `sensed` [4] is the orientation of the IMU in its world frame, `known` [4] that in the palm frame at the same time.
-    All three angles come from this pose. Gravity would give two of them only if the palm's own lean were known: a mount
-    that leans would then look like a turned object. What the pose is off by stays as a constant error.
-    """
-    return multiply(known, conjugate(sensed))
-
-
 class ImuReader:
     """From an IMU's bytes to the orientation of the object in the palm frame.
+
+    All three angles between the IMU's world and the palm come from one known pose (`calibrate`). Gravity would give two
+    of them only if the palm's own lean were known: a mount that leans would then look like a turned object. What the
+    pose is off by stays as a constant error.
 
     A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
     the last sound one than an object turns between two samples is left out; when the next ones are, too, `jumped` is
@@ -151,7 +139,7 @@ class ImuReader:
     def calibrate(self, known: np.ndarray) -> None:
         """Align: the object now has the orientation `known` [4] in the palm frame."""
         assert self._newest is not None, "`wait` for the first orientation"
-        self._world = align(self._newest[1], multiply(known, self._mount))
+        self._world = multiply(multiply(known, self._mount), conjugate(self._newest[1]))
 
     def read(self) -> tuple[float, np.ndarray]:
         """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""

@@ -47,7 +47,7 @@ def ideal_calibration(hand: Hand) -> Calibration:
     def side(gain: np.ndarray) -> Side:
         both, one = np.broadcast_to(gain, (2, hand.num_joints)).astype(float), np.ones(hand.num_joints)
         zero = np.zeros_like(both)
-        return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero, 0 * one, one, one)
+        return Side(both, zero, zero, zero, zero + 1, 0 * one, one, one)
 
     return Calibration(
         real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
