@@ -81,7 +81,7 @@ class VirtualPort(HandPort):
         sent = self.time
         self.wait_until(sent + REQUEST)
         request = Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes())
-        answer = self.firmware.answer(request, self.time)
+        answer = self.firmware.answer(request)
         assert answer is not None, "the request is addressed to this hand"
         self.wait_until(sent + ROUND_TRIP)
         self._sequence += 1
