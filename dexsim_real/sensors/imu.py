@@ -15,8 +15,7 @@ import time
 import mujoco
 import numpy as np
 
-from dexsim.core.install import install_line
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
+from dexsim_real.core.errors import HandError, open_serial
 
 HEAD = b"\xaa\xaa"
 SIZE = 19
@@ -30,12 +29,6 @@ _SAMPLES = 5  # in a row that are far from the last make a jump: a damaged frame
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
-
-
-def check_mount(mount: tuple[float, ...], where: str) -> None:
-    """Raises HandError: an orientation [4] of (nearly) no length; `where` names the option."""
-    if np.linalg.norm(mount) < 1e-3:
-        raise HandError(f"{where} {' '.join(f'{v:g}' for v in mount)}: is no orientation (w, x, y, z)")
 
 
 def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
@@ -168,14 +161,7 @@ class Imu(ImuReader):
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
         super().__init__(mount, port)
         self._stop = threading.Event()
-        try:
-            import serial
-        except ImportError:
-            raise HandError(f"pyserial is missing: {install_line('real')}") from None
-        try:
-            self._serial = serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
-        except PORT_ERRORS as error:
-            raise HandError(explain(port, error)) from None
+        self._serial = open_serial(port, BAUD, timeout=0.05)
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
 

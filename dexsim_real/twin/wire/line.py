@@ -59,17 +59,13 @@ class Terminal:
 
     def close(self) -> None:
         """Disconnect: programs that have the terminal open get an error."""
-        if self.connected:
+        if self._master >= 0:
             with contextlib.suppress(OSError):
                 if os.readlink(self.name) == os.ttyname(self._slave):
                     self.name.unlink()
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
-
-    @property
-    def connected(self) -> bool:
-        return self._master >= 0
 
     def fileno(self) -> int:
         return self._master

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dexsim.observation import GRASP, ROTATE, ROTATE_CRITIC
+from dexsim_real.control.controller import sources_of
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
-from dexsim_real.sensors.readings import sources_of
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
