@@ -99,7 +99,8 @@ def joint_torque(calibration: Calibration, current: Array) -> jax.Array:
         for side in (calibration.real, calibration.sim)
         for line in (side.gain, side.offset)
     )
-    return sim_gain * (current - offset) / gain + sim_offset
+    force = (current - offset) / gain
+    return sim_gain * force + sim_offset
 
 
 def normalised_torque(calibration: Calibration, current: jax.Array) -> jax.Array:

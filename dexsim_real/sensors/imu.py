@@ -12,7 +12,6 @@ import struct
 import threading
 import time
 
-import mujoco
 import numpy as np
 
 from dexsim_real.core.errors import HandError, open_serial
@@ -51,9 +50,16 @@ def decode(frame: bytes) -> np.ndarray | None:
     _, yaw, pitch, roll, *_ = _BODY.unpack(body)
     if abs(yaw) > 18000 or abs(pitch) > 9000 or abs(roll) > 18000:
         return None
-    quat = np.empty(4)
-    mujoco.mju_euler2Quat(quat, np.radians([yaw, pitch, roll]) / 100, "zyx")
-    return quat
+    half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
+    (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
 
 
 class RvcParser:
