@@ -21,7 +21,7 @@ MIN_MOTION = 0.02
 """rad that the joint must have moved."""
 
 _SATURATED = 0.6, 0.97  # share of the samples that may have this share of the largest torque
-_PARTS = 20  # of a log that hardly ever rests
+_PARTS = 20  # equal stretches of a log
 _NULL = 1e-4  # singular values below this share of the largest are none: the Jacobian is float32
 _CORRELATED, _VAGUE = 0.97, 0.5
 _NORMAL = 1.96  # 97.5 % quantile
@@ -184,8 +184,9 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
-    The wider of two intervals counts: that of independent residuals, and a jackknife over the segments. What the model
-    gets wrong differs from signal to signal, and residuals of one signal go together.
+    The widest of three intervals counts: that of independent residuals, and jackknives over the segments and over equal
+    stretches of time. What the model gets wrong differs from signal to signal, and residuals that follow each other go
+    together.
 
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
@@ -203,10 +204,12 @@ def uncertainty(
     inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
     covariance = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    if len(np.unique(segment)) < LEAST_PRESSES:
-        segment = np.arange(len(segment)) * _PARTS // len(segment)
-    part = np.tile(segment, len(residual) // len(segment))
-    half = np.maximum(_NORMAL * spread, jackknife(relative, relative, residual, part)) * size
+    half = _NORMAL * spread
+    for group in (segment, np.arange(len(segment)) * _PARTS // len(segment)):
+        if len(np.unique(group)) >= LEAST_PRESSES:
+            own = np.tile(group, len(residual) // len(group))
+            half = np.maximum(half, jackknife(relative, relative, residual, own))
+    half = half * size
     correlation = covariance / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
