@@ -25,7 +25,7 @@ COMMANDS = {
     "ros": ("dexsim_real.ros", "a hand as a ROS 2 node"),
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
-    "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
+    "replay": ("dexsim_real.replay", "recompute and plot the log of a run"),
     "check-hand": ("dexsim.check_hand", "check the files of a hand"),
     "import-hand": ("dexsim.import_hand", "make a hand's folder from a URDF or MJCF, or its mirror image"),
 }

@@ -5,33 +5,40 @@ A run on a hand is this loop in a thread of its own (`LoopThread`), a calibratio
 """
 
 import contextlib
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dexsim_real.control.motors_off import BRIEF, PATIENCE, turn_off
-from dexsim_real.control.safety import HandSample, Safety, SafetyDecision
+from dexsim.core.config import Config, setting
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
-from dexsim_real.sensors.hand import HandSensing, VelocityFilter
-from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, Reply
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.wire.frames import Mode, passive_command
+from dexsim_real.wire.link import BRIEF, PATIENCE, HandPort, LinkConfig, Reply
 
 TARE_SAMPLES = 30
 _TARE = 5.0  # s in which they must arrive
 
 
-class Exchange(NamedTuple):
-    """An answered exchange."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoopOptions(Config):
+    """Options of the exchange loop."""
 
-    decision: SafetyDecision  # what was sent
-    sample: HandSample
-    state: np.ndarray  # `frames.STATE_BLOCK` or `frames.driver_block`
-    plausible: bool  # whether `Safety` takes the sample for a measurement
+    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
+    """Exchanges with the hand per second; a run adjusts it by up to 1 %, to compute during the wait for an answer."""
+    link: LinkConfig = setting(LinkConfig())
+    """The serial line."""
+    hardware: HardwareConfig = setting(HardwareConfig())
+    """Signs, scales and gains of the hand."""
+    safety: SafetyConfig = setting(SafetyConfig())
+    """Safety limits."""
 
 
 class ExchangeLoop:
@@ -62,6 +69,7 @@ class ExchangeLoop:
         self.port, self.sensing, self.safety, self.clock = port, sensing, safety, clock
         self.pace, self._beat = Pace(rate, clock, sleep), beat
         self.round_trip = Timing()
+        self.command = passive_command(sensing.hand.num_joints)  # the newest that was sent
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self.track_taxels = track_taxels
@@ -73,33 +81,26 @@ class ExchangeLoop:
         """Turn the motors on at the next cycle; may be called from another thread."""
         self._engage = True
 
-    def cycle(self) -> Exchange | None:
-        """One exchange; None without an answer."""
+    def cycle(self) -> HandSample | None:
+        """One exchange; None without an answer. `Safety.problem` tells whether the sample is a measurement."""
         self._beat(0.0)
-        decision, command = self.request()
-        return self.take(decision, self.port.exchange(command))
-
-    def request(self) -> tuple[SafetyDecision, np.ndarray]:
-        """What to send now, and its joint commands (`frames.command_block`)."""
         if self._engage:
             self.safety.engage()
             self._engage = False
         decision = self.safety.decide(self.clock())
-        self.driven |= decision.mode == Mode.POSITION
-        return decision, self.sensing.command(decision.position, decision.mode, decision.stiffness)
-
-    def take(self, decision: SafetyDecision, reply: Reply | None) -> Exchange | None:
-        """Update with the answer to a request; None without one."""
+        on = decision.mode == Mode.POSITION
+        self.driven |= on
+        self.command = self.sensing.command(decision.position, decision.mode, decision.stiffness)
+        reply = self.port.exchange(self.command)
         if reply is None:
             self.safety.refuse(self.port.refusal)
             return None
-        self.driven = decision.mode == Mode.POSITION
+        self.driven = on
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)
-        plausible = self.safety.update(sample)
-        if plausible:
+        if self.safety.update(sample):
             self._filter.update(sample.time, sample.measured.joint_position)
-        return Exchange(decision, sample, reply.state, plausible)
+        return sample
 
     def tare(self) -> list[str]:
         """Tare the taxels with the motors off; returns a line for each fingertip with stuck taxels.
@@ -109,9 +110,9 @@ class ExchangeLoop:
         states, until = list[np.ndarray](), self.clock() + _TARE
         tracked, self.track_taxels = self.track_taxels, False  # Untared, a zero is a touch.
         while len(states) < TARE_SAMPLES and self.clock() < until:
-            exchange = self.cycle()
-            if exchange is not None:
-                states.append(exchange.state)
+            sample = self.cycle()
+            if sample is not None:
+                states.append(sample.state)
             elif (refusal := self.port.refusal) and refusal.serious:
                 raise HandError(refusal.text)
         if len(states) < TARE_SAMPLES:
@@ -131,7 +132,7 @@ class ExchangeLoop:
         self._closed, seconds = True, PATIENCE if self.driven else BRIEF
         self._beat(seconds)
         try:
-            if turn_off(self.port, off, seconds):
+            if self.port.turn_off(off, seconds):
                 self.driven = False
         finally:
             with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
@@ -148,7 +149,7 @@ class ExchangeLoop:
             self._filter.reset()
         self._generation = reply.generation
         velocity = self._filter.estimate(reply.received, measured.joint_position)
-        return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
+        return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity, reply.state)
 
 
 class LoopThread(ExchangeLoop):
@@ -201,8 +202,7 @@ class LoopThread(ExchangeLoop):
         try:
             self.pace.next = self.clock() + self.pace.period
             while not self._stop.is_set():
-                exchange = self.cycle()
-                if exchange is not None and exchange.plausible:
+                if self.cycle() is not None and not self.safety.problem:
                     self._fresh.set()
                 self.pace.wait()
         except BaseException as error:  # The main thread reports it.

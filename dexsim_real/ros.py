@@ -29,9 +29,8 @@ from dexsim.hand.description import Hand
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
-from dexsim_real.loop import LoopThread
+from dexsim_real.loop import LoopOptions, LoopThread
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.options import LoopOptions
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.serial_hand import open_port
 
@@ -40,6 +39,8 @@ from dexsim_real.wire.serial_hand import open_port
 class NodeOptions(LoopOptions):
     """Options in the parameter `options`."""
 
+    guard: bool = True
+    """Start a second process that turns the motors off when this one dies or freezes."""
     safety: SafetyConfig = setting(SafetyConfig(watchdog=0.2))
     """Safety limits."""
 

@@ -5,7 +5,7 @@ leaves out a press, or a twentieth of the samples by x, at a time. The first sho
 second what recurs in all of them (motor ripple) and noise that is correlated along x; the wider one counts.
 """
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -21,37 +21,18 @@ _START = 300  # samples that the Theil-Sen line is drawn through, for all pairs 
 _BLOCKS = (5, 20)  # parts of the samples by x, fewest and most
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Line:
-    """The line y = gain x + offset, with 95 % intervals."""
+class Line(NamedTuple):
+    """The line y = gain x + offset; an error is half of a 95 % interval."""
 
     gain: float
     offset: float
-    gain_interval: tuple[float, float]
-    offset_interval: tuple[float, float]
-    noise: float
-    """Robust standard deviation of the residuals, in units of y."""
-    r_squared: float
-    """Share of the variance that the line explains, without outliers."""
-    samples: int
-    outliers: int
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """The line at x."""
-        return self.gain * np.asarray(x) + self.offset
-
-    @property
-    def gain_share(self) -> float:
-        """Half the interval of the gain, as a share of the gain."""
-        return (self.gain_interval[1] - self.gain_interval[0]) / 2 / abs(self.gain)
-
-    def widened(self, share: float) -> "Line":
-        """The line with an error of this share of the gain (95 %), which the data cannot show, in its interval."""
-        half = float(np.hypot(self.gain_share, share)) * abs(self.gain)
-        return dataclasses.replace(self, gain_interval=(self.gain - half, self.gain + half))
+    gain_error: float
+    offset_error: float
+    r_squared: float  # share of the variance that the line explains, without outliers
+    inside: np.ndarray  # [T] bool, the samples that are no outliers
 
 
-def fit_line(x: np.ndarray, y: np.ndarray, press: np.ndarray | None = None) -> Line:
+def fit_line(x: np.ndarray, y: np.ndarray, press: np.ndarray) -> Line:
     """Fit y = gain x + offset.
 
     Args:
@@ -60,15 +41,14 @@ def fit_line(x: np.ndarray, y: np.ndarray, press: np.ndarray | None = None) -> L
         intervals.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    reach = np.max(np.abs(x))
-    design = np.stack([np.ones_like(x), x / reach], -1)
+    scale = np.array([1.0, np.max(np.abs(x))])
+    design = np.stack([np.ones_like(x), x / scale[1]], -1)
     some = np.random.default_rng(0).permutation(len(x))[:_START]
     gain, offset, *_ = theilslopes(y[some], x[some])
-    residual = y - gain * x - offset
-    noise = max(_MAD * float(np.median(np.abs(residual))), 1e-9 * float(np.max(np.abs(y))), 1e-300)
+    noise = max(_MAD * float(np.median(np.abs(y - gain * x - offset))), 1e-9 * float(np.max(np.abs(y))), 1e-300)
     fit = least_squares(
         lambda guess: (design @ guess - y) / noise,
-        (offset, gain * reach),
+        (offset, gain * scale[1]),
         jac=lambda guess: design / noise,
         loss="cauchy",
         f_scale=_CAUCHY,
@@ -78,33 +58,31 @@ def fit_line(x: np.ndarray, y: np.ndarray, press: np.ndarray | None = None) -> L
     square = (residual / (_CAUCHY * noise)) ** 2
     weight = 1.0 / (1.0 + square)
     slope = np.mean((1.0 - square) * weight**2)  # of the influence: how much a sample moves the line by itself
-    score = (weight * residual)[:, None] * design
     order, blocks = np.argsort(x, kind="stable"), int(np.clip(len(x) // 10, *_BLOCKS))
     block = np.empty(len(x), int)
     block[order] = np.arange(len(x)) * blocks // len(x)
-    half = _jackknife(design, slope, score, block)
-    if press is not None and len(np.unique(press)) >= LEAST_PRESSES:
-        half = np.maximum(half, _jackknife(design, slope, score, np.asarray(press)))
-    (offset, gain), half = fit.x / [1.0, reach], half / [1.0, reach]
-    centred = y - np.average(y, weights=weight)
-    return Line(
-        gain=float(gain),
-        offset=float(offset),
-        gain_interval=(float(gain - half[1]), float(gain + half[1])),
-        offset_interval=(float(offset - half[0]), float(offset + half[0])),
-        noise=noise,
-        r_squared=float(1.0 - np.sum(weight * residual**2) / max(np.sum(weight * centred**2), 1e-300)),
-        samples=len(x),
-        outliers=int(np.sum(np.abs(residual) > _OUTLIER * noise)),
-    )
+    groups = [block] + [press] * (len(np.unique(press)) >= LEAST_PRESSES)
+    error = np.max([jackknife(slope * design, design, weight * residual, group) for group in groups], 0)
+    (offset, gain), error = fit.x / scale, error / scale
+    explained = np.sum(weight * (y - np.average(y, weights=weight)) ** 2)
+    r_squared = float(1.0 - np.sum(weight * residual**2) / max(explained, 1e-300))
+    inside = np.abs(residual) <= _OUTLIER * noise
+    return Line(float(gain), float(offset), float(error[1]), float(error[0]), r_squared, inside)
 
 
-def _jackknife(design: np.ndarray, slope: float, score: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Half the 95 % interval [P] of a fit, from what it is without a group at a time: a Newton step each."""
-    number = np.unique(group, return_inverse=True)[1]
-    count = int(number.max()) + 1
-    normal, push = np.zeros((count, 2, 2)), np.zeros((count, 2))
-    np.add.at(normal, number, slope * design[:, :, None] * design[:, None, :])
-    np.add.at(push, number, score)
-    moved = np.linalg.solve(normal.sum(0) - normal, push[..., None])[..., 0]
-    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(moved**2, 0))
+def jackknife(curvature: np.ndarray, design: np.ndarray, residual: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Half the 95 % interval [P] of a least-squares fit, from what it is without a group at a time: a Newton step each.
+
+    Args:
+      curvature: [N, P]; with the design it gives the Hessian, curvature^T design.
+      design: [N, P] derivatives of the model.
+      residual: [N], weighted.
+      group: [N] int, samples that belong together.
+    """
+    moved, whole = [], curvature.T @ design
+    for number in np.unique(group):
+        own = group == number
+        rest = np.linalg.pinv(whole - curvature[own].T @ design[own], rcond=1e-8, hermitian=True)
+        moved.append(rest @ (design[own].T @ residual[own]))
+    count = len(moved)
+    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))

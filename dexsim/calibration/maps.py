@@ -6,7 +6,7 @@ lines, current = g_real F + o_real and torque = g_sim F + o_sim, so the force dr
     torque = g_sim (current - o_real) / g_real + o_sim
 
 (paper, section Current-torque Calibration). The paper aligns the two by their maxima; that is the
-same line when both sessions end at the same force, and `alignment` says how far they are apart.
+same line when both sessions end at the same force and have no offset.
 `dexsim.calibration.fit` makes a `Calibration` from recordings; this module keeps and applies it.
 
 Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloading).
@@ -27,30 +27,22 @@ from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.description import Hand
 
 FORMAT = "dexsim calibration"
-VERSION = 3
+VERSION = 4
 
 
 @pytree_dataclass
 class Side:
-    """Lines value = gain force + offset of all joints: of the hand (value A) or of the
-    simulation (value Nm). Intervals are of 95 %."""
+    """Lines value = gain force + offset of all joints: of the hand (value A) or of the simulation (value Nm). An error
+    is half of a 95 % interval."""
 
     gain: Array  # [2, J] value/N
-    gain_low: Array  # [2, J]
-    gain_high: Array  # [2, J]
     offset: Array  # [2, J] value
-    offset_low: Array  # [2, J]
-    offset_high: Array  # [2, J]
-    noise: Array  # [2, J] value, robust standard deviation about the line
+    gain_error: Array  # [2, J] value/N
+    offset_error: Array  # [2, J] value
     r_squared: Array  # [2, J]
-    samples: Array  # [2, J]; 0 for a line taken from the joint's class
-    friction: Array  # [J] value, half the gap between the two lines; NaN where one is missing
+    friction: Array  # [J] value, half the gap between the two lines; NaN with one
     value_max: Array  # [J] largest |value| recorded
     force_max: Array  # [J] N, largest force recorded
-
-    def middle(self) -> tuple[jax.Array, jax.Array]:
-        """Gain [J] and offset [J] of the line half way between loading and unloading."""
-        return jnp.mean(self.gain, 0), jnp.mean(self.offset, 0)
 
 
 @pytree_dataclass
@@ -73,11 +65,7 @@ class Calibration:
 
 def blank_calibration(hand: Hand) -> Calibration:
     """A template of a hand's calibration: every measured number is NaN, which `load_calibration` refuses."""
-    shapes = {
-        field.name: hand.num_joints if field.name in _ONE_A_JOINT else (2, hand.num_joints)
-        for field in dataclasses.fields(Side)
-    }
-    side = Side(**{name: np.full(shape, np.nan) for name, shape in shapes.items()})
+    side = Side(**{name: np.full(shape, np.nan) for name, shape in _shapes(hand.num_joints).items()})
     return Calibration(
         real=side,
         sim=side,
@@ -90,6 +78,13 @@ def blank_calibration(hand: Hand) -> Calibration:
     )
 
 
+def _shapes(joints: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a `Side`."""
+    single = ("friction", "value_max", "force_max")
+    names = [field.name for field in dataclasses.fields(Side)]
+    return {name: (joints,) if name in single else (2, joints) for name in names}
+
+
 # --- run time -------------------------------------------------------------------------------
 
 
@@ -99,9 +94,13 @@ def joint_torque(calibration: Calibration, current: Array) -> jax.Array:
     By the lines half way between loading and unloading: a run does not know which way friction acts. They are wrong by
     at most the friction band, `calibration.real.friction`.
     """
-    (gain, offset), (sim_gain, sim_offset) = calibration.real.middle(), calibration.sim.middle()
-    force = (current - align(offset, current)) / align(gain, current)
-    return align(sim_gain, force) * force + align(sim_offset, force)
+    gain, offset, sim_gain, sim_offset = (
+        align(jnp.mean(line, 0), current)
+        for side in (calibration.real, calibration.sim)
+        for line in (side.gain, side.offset)
+    )
+    force = (current - offset) / gain
+    return sim_gain * force + sim_offset
 
 
 def normalised_torque(calibration: Calibration, current: jax.Array) -> jax.Array:
@@ -125,15 +124,12 @@ def normalise(side: Side, joint: int, force: np.ndarray, value: np.ndarray) -> t
     )
 
 
-def alignment(calibration: Calibration) -> np.ndarray:
-    """Slope [J] of the hand's normalised line over that of the simulation's.
-
-    1 where aligning by the maxima, as in the paper, gives the same torque as the lines do.
-    """
-    real, sim = (
-        np.abs(np.mean(side.gain, 0)) * side.force_max / side.value_max for side in (calibration.real, calibration.sim)
-    )
-    return np.asarray(real / sim)
+def torque_constants(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Torque constants [2, J] Nm/A at the joint, loading and unloading, and half of their 95 % intervals [2, J]."""
+    real, sim = calibration.real, calibration.sim
+    constants = np.asarray(sim.gain) / np.asarray(real.gain)
+    share = np.hypot(*(np.asarray(side.gain_error) / np.abs(side.gain) for side in (real, sim)))
+    return constants, np.abs(constants) * share
 
 
 def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
@@ -157,10 +153,9 @@ _UNITS = {
     "force_per_count": "N, of each finger",
     "force_per_torque": "N/Nm, of each finger: value, 95 % low and high; 0: not pressed",
 }
-_ONE_A_JOINT = ("friction", "value_max", "force_max")
 _SIDES = """
 # Lines value = gain * force + offset of all joints, loading and then unloading: value in A on the hand (real), in Nm in
-# simulation (sim), force in N. Intervals are of 95 %."""
+# simulation (sim), force in N. Errors are half of the 95 % intervals."""
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
@@ -171,8 +166,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
     lines += [f"{name} = {_text(value)}  # {_UNITS[name]}" for name, value in numbers.items() if value is not None]
     lines.append(_SIDES)
     for name, side in (("real", calibration.real), ("sim", calibration.sim)):
-        lines.append(f"[{name}]")
-        lines += [f"{field} = {_text(values)}" for field, values in vars(side).items()]
+        lines += [f"[{name}]", *(f"{field} = {_text(values)}" for field, values in vars(side).items())]
     try:
         write_atomic(Path(path), ["\n".join([*lines, ""]).encode()])
     except OSError as error:
@@ -191,8 +185,8 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
       hand: if given, the hand that it must belong to.
 
     Raises:
-      CalibrationError: missing, cut, not a calibration, of a newer version, of another hand, or with a number
-        that no hand gives.
+      CalibrationError: missing, cut, not a calibration, of another version or hand, or with a number that no hand
+        gives.
     """
     try:
         calibration = _calibration(read_toml(Path(path)))
@@ -213,39 +207,29 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
 
 def _calibration(table: dict[str, Any]) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
-    if table["format"] != FORMAT or table["version"] != VERSION:
-        raise ValueError(f"expected version {VERSION}, got {table['version']!r:.20}")
-    _refuse_unknown(table, "format", "version", *_WORDS, *_UNITS, "real", "sim")
+    kind, version = table.pop("format"), table.pop("version")
+    if kind != FORMAT or version != VERSION:
+        raise ValueError(f"expected version {VERSION}, got {version!r:.20}")
     words: dict[str, Any] = {
-        name: tuple(map(str, v)) if isinstance(v := table[name], list) else str(v) for name in _WORDS
+        name: tuple(map(str, v)) if isinstance(v := table.pop(name), list) else str(v) for name in _WORDS
     }
     joints, fingers = len(words["joint_names"]), len(words["finger_names"])
 
-    def numbers(part: dict[str, Any], name: str, *shape: int) -> np.ndarray:
-        values = np.array(part[name], float)
-        if values.shape != shape:
-            raise ValueError(f"{name!r} must hold {' x '.join(map(str, shape))} numbers")
-        return values
+    def numbers(part: dict[str, Any], shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+        if unknown := set(part) - set(shapes):
+            raise ValueError(f"unknown entry {min(unknown)!r}")
+        arrays = {name: np.array(part[name], float) for name in shapes}
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise ValueError(f"{name!r} must hold {' x '.join(map(str, shape))} numbers")
+        return arrays
 
-    def side(part: dict[str, Any]) -> Side:
-        names = [field.name for field in dataclasses.fields(Side)]
-        _refuse_unknown(part, *names)
-        shapes = {name: (joints,) if name in _ONE_A_JOINT else (2, joints) for name in names}
-        return Side(**{name: numbers(part, name, *shape) for name, shape in shapes.items()})
-
-    return Calibration(
-        side(table["real"]),
-        side(table["sim"]),
-        torque_scale=numbers(table, "torque_scale", joints),
-        force_per_count=numbers(table, "force_per_count", fingers),
-        force_per_torque=numbers(table, "force_per_torque", 3, fingers) if "force_per_torque" in table else None,
-        **words,
-    )
-
-
-def _refuse_unknown(table: dict[str, Any], *known: str) -> None:
-    if unknown := set(table) - set(known):
-        raise ValueError(f"unknown entry {min(unknown)!r}")
+    real, sim = (Side(**numbers(table.pop(name), _shapes(joints))) for name in ("real", "sim"))
+    shapes: dict[str, tuple[int, ...]] = {"torque_scale": (joints,), "force_per_count": (fingers,)}
+    if "force_per_torque" in table:
+        shapes["force_per_torque"] = 3, fingers
+    arrays: dict[str, Any] = numbers(table, shapes)
+    return Calibration(real, sim, **arrays, **words)
 
 
 # --- what no hand gives -----------------------------------------------------------------------

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.calibration.joint import JointPress, find_direction
-from dexsim.calibration.maps import Calibration, Side, normalise
+from dexsim.calibration.fit import JointPress
+from dexsim.calibration.maps import Calibration, normalise
+from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
-
-_WAYS = (("loading", 1, "tab:blue"), ("unloading", -1, "tab:orange"))
 
 
 def plot_calibration(
@@ -31,34 +30,25 @@ def plot_calibration(
     if not names:
         raise CalibrationError("nothing to draw: no joint was recorded on both sides")
     figure = Figure(figsize=(11, 2.6 * len(names) + 0.4), layout="constrained")
-    axes = figure.subplots(len(names), 3, squeeze=False)
-    for (left, middle, right), name in zip(axes, names, strict=True):
+    for row, name in zip(figure.subplots(len(names), 3, squeeze=False), names, strict=True):
         joint = calibration.joint_names.index(name)
-        left.set(title=f"{name}, hand", xlabel="force, N", ylabel="current, A")
-        middle.set(title=f"{name}, simulation", xlabel="force, N", ylabel="torque, Nm")
-        right.set(title="both, normalised", xlabel="force / its maximum", xlim=(-0.05, 1.05), ylim=(-0.15, 1.15))
-        _draw_lines(left, calibration.real, joint, real[name])
-        _draw_lines(middle, calibration.sim, joint, sim[name])
-        _draw_normalised(right, calibration.real, joint, real[name], "tab:green", "current (hand)")
-        _draw_normalised(right, calibration.sim, joint, sim[name], "tab:red", "torque (simulation)")
-        for axis in (left, middle, right):
+        for axis, side, press, where, label, colour in (
+            (row[0], calibration.real, real[name], "hand", "current, A", "tab:green"),
+            (row[1], calibration.sim, sim[name], "simulation", "torque, Nm", "tab:red"),
+        ):
+            axis.set(title=f"{name}, {where}", xlabel="force, N", ylabel=label)
+            force, value = np.asarray(press.force), np.asarray(press.value)
+            direction = find_swings(force)[0] if press.direction is None else np.sign(press.direction)
+            ends, lines = np.array([0.0, side.force_max[joint]]), []
+            for way, (motion, sign) in enumerate((("loading", 1), ("unloading", -1))):
+                gain, offset = side.gain[way, joint], side.offset[way, joint]
+                lines.append(gain * ends + offset)
+                text = f"{motion}: {gain:.3g} F {offset:+.2g}, R² {side.r_squared[way, joint]:.3f}"
+                axis.plot(force[direction == sign], value[direction == sign], ".", ms=2, alpha=0.35, color=f"C{way}")
+                axis.plot(ends, lines[-1], color=f"C{way}", lw=1.4, label=text)
+            row[2].plot(*normalise(side, joint, force, value), ".", ms=2, alpha=0.3, color=colour)
+            row[2].plot(*normalise(side, joint, ends, np.mean(lines, 0)), color=colour, lw=1.4, label=label)
+        row[2].set(title="both, normalised", xlabel="force / its maximum", xlim=(-0.05, 1.05), ylim=(-0.15, 1.15))
+        for axis in row:
             axis.legend(fontsize=6)
     figure.savefig(path, dpi=110)
-
-
-def _draw_lines(axis, side: Side, joint: int, press: JointPress) -> None:
-    direction = find_direction(press.force) if press.direction is None else np.asarray(press.direction)
-    ends = np.array([0.0, side.force_max[joint]])
-    for row, (name, sign, colour) in enumerate(_WAYS):
-        here = np.sign(direction) == sign
-        axis.plot(np.asarray(press.force)[here], np.asarray(press.value)[here], ".", ms=2, alpha=0.35, color=colour)
-        gain, offset = side.gain[row, joint], side.offset[row, joint]
-        text = f"{name}: {gain:.3g} F {offset:+.2g}, R² {side.r_squared[row, joint]:.3f}"
-        axis.plot(ends, gain * ends + offset, color=colour, lw=1.4, label=text)
-
-
-def _draw_normalised(axis, side: Side, joint: int, press: JointPress, colour: str, label: str) -> None:
-    axis.plot(*normalise(side, joint, press.force, press.value), ".", ms=2, alpha=0.3, color=colour)
-    ends = np.array([0.0, side.force_max[joint]])
-    line = np.mean(side.gain[:, joint]) * ends + np.mean(side.offset[:, joint])
-    axis.plot(*normalise(side, joint, ends, line), color=colour, lw=1.4, label=label)

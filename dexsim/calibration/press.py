@@ -18,16 +18,26 @@ MIN_LEVER = 0.005
 """m; joints with a shorter lever arm hardly feel the press and are left out."""
 
 
-def lever_arms(hand: Hand, joint_position: np.ndarray, finger: int, taxel: int) -> np.ndarray:
-    """Torque [J] Nm per newton that the joints, at [J] rad, must give to press along a taxel's outward normal."""
-    at = jnp.asarray(joint_position, jnp.float32)
-    return np.asarray(_lever_arms(hand, at, jnp.int32(finger), jnp.int32(taxel)), float)
+def lever_arms(hand: Hand, joint_position: np.ndarray, finger: int, taxel: int | np.ndarray) -> np.ndarray:
+    """Torque [J] Nm per newton that the joints, at [J] rad, must give to press along the outward normal of a taxel, or
+    along the mean normal of taxels with these shares [N] of the force."""
+    share = np.eye(hand.num_taxels)[taxel] if isinstance(taxel, int) else taxel
+    normal, jacobian = contact_jacobian(hand, joint_position, finger, share)
+    return normal @ jacobian
+
+
+def contact_jacobian(
+    hand: Hand, joint_position: np.ndarray, finger: int, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean outward normal [3] of taxels with these shares [N] of a force, and the Jacobian [3, J] m of their mean
+    place, at [J] rad."""
+    arguments = (jnp.asarray(part, jnp.float32) for part in (joint_position, share))
+    normal, jacobian = _contact_jacobian(hand, jnp.int32(finger), *arguments)
+    return np.asarray(normal, float), np.asarray(jacobian, float)
 
 
 @functools.partial(jax.jit, static_argnames="hand")
-def _lever_arms(hand: Hand, at: jax.Array, finger: jax.Array, taxel: jax.Array) -> jax.Array:
-    def place(position: jax.Array) -> jax.Array:
-        return taxel_positions(hand, forward_kinematics(hand, position))[finger, taxel]
-
-    normal = taxel_normals(hand, forward_kinematics(hand, at))[finger, taxel]
-    return jnp.sum(jax.jacfwd(place)(at) * normal[:, None], 0)
+def _contact_jacobian(hand: Hand, finger: jax.Array, at: jax.Array, share: jax.Array) -> tuple[jax.Array, jax.Array]:
+    normal = share @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
+    jacobian = jax.jacfwd(lambda q: share @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
+    return normal / jnp.maximum(jnp.linalg.norm(normal), 1e-6), jacobian

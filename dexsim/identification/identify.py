@@ -9,24 +9,19 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import stdtrit
 
+from dexsim.calibration.line import LEAST_PRESSES, jackknife
+from dexsim.calibration.signals import check_signals
 from dexsim.core.errors import CalibrationError
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 from dexsim.identification.search import CHI2, Search
-
-_LEAST_GROUPS = 3  # segments below which their differences are not part of an interval
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
 """rad that the joint must have moved."""
 
-MODEL = (
-    "the intervals hold for a joint that obeys this model at this time step; on C MuJoCo's joint at steps of 0.5 ms "
-    "gains came out 2 % low, Coulomb friction 6 % high and viscous friction 12 % low"
-)
-"""Note of every identification."""
-
+_SATURATED = 0.6, 0.97  # share of the samples that may have this share of the largest torque
+_PARTS = 20  # equal stretches of a log
 _NULL = 1e-4  # singular values below this share of the largest are none: the Jacobian is float32
 _CORRELATED, _VAGUE = 0.97, 0.5
 _NORMAL = 1.96  # 97.5 % quantile
@@ -47,8 +42,6 @@ class Identification:
     intervals: dict[str, tuple[float, float]]
     """95 %, of the fitted ones; infinite where the data do not tell. Noise and what differs from signal to signal are
     in it, another engine's steps are not."""
-    correlation: np.ndarray
-    """[P, P], in the order of `fitted`; NaN for what the data do not tell."""
     latency: int
     """Sub-steps."""
     latency_plausible: tuple[int, ...]
@@ -60,8 +53,6 @@ class Identification:
     at_bound: tuple[str, ...]
     rmse: float
     """rad, of the angles fitted to."""
-    torque_rmse: float
-    """Nm; NaN without torques."""
     holdout_rmse: float
     """rad, on a log that was not fitted to; NaN without one."""
     holdout_rmse_before: float
@@ -114,76 +105,78 @@ def identify(
         check_log(recording)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
-    latency, theta, count = search.latency, search.theta, search.count
+    latency, count = search.latency, search.count
     fitted = search.names[:count]
-    residual = search.residual(theta, search.starts)
-    intervals, correlation, unidentifiable = _intervals(search, residual)
+    theta, low, high = (part[:count] for part in (search.theta, search.low, search.high))
+    residual = search.residual(search.theta, search.starts)
+    rmse = search.noise[0] * np.sqrt(np.mean(residual[: len(log.position)] ** 2))
     first = {name: float(value) for name, value in search.fixed.items()}
-    values = first | dict(zip(search.names, map(float, theta), strict=True)) | {"start": float(search.starts[0])}
-    margin = 1e-3 * _size(search)
-    at_low, at_high = theta[:count] <= search.low[:count] + margin, theta[:count] >= search.high[:count] - margin
-    at_bound = tuple(name for name, hit in zip(fitted, at_low | at_high, strict=True) if hit)
+    values = first | dict(zip(search.names, search.theta.tolist(), strict=True)) | {"start": float(search.starts[0])}
+    size = np.maximum(np.abs(theta), search.typical[:count])  # what counts as a relative change of 1
+    jacobian = search.jacobian(search.theta, search.starts)
+    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
+    sizes = np.append(size, np.full(len(search.starts), 0.05))
+    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
+    half, correlation = half[:count], correlation[:count, :count]
+    least, largest = (part[:count] for part in search.plausible())
+    if dead_band is not None:
+        ends = search.dead_band_profile(dead_band)
+        least[-1], largest[-1] = min(ends[0], least[-1]), max(ends[1], largest[-1])
+    # What was seen to fit as well farther off widens what the curvature says.
+    least, largest = np.minimum(theta - half, least).clip(low), np.maximum(theta + half, largest).clip(None, high)
+    vague = np.maximum(half, (largest - least) / 2) > _NORMAL * _VAGUE * size
+    unidentifiable = _groups(fitted, [members[:count] for members in null], correlation, vague)
+    margin = 1e-3 * size
+    at_bound = tuple(np.array(fitted)[(theta <= low + margin) | (theta >= high - margin)].tolist())
     # All from the solution and with the weights found last: costs under other weights cannot be compared.
     cost = {}
     for search.latency in sorted(latencies):
-        cost[search.latency] = search.solve(theta, 10)[0]
+        cost[search.latency] = search.solve(search.theta, 10)[0]
     limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")
     if holdout is not None:
-        before, _ = evaluate(holdout, first, latency=latency, substeps=substeps)
-        after, _ = evaluate(holdout, values, latency=latency, substeps=substeps)
-    rmse = np.sqrt(np.mean((residual.reshape(search.measured.shape) * search.noise[:, None]) ** 2, -1))
-    notes = [MODEL, *(_GROUP.format(", ".join(group)) for group in unidentifiable)]
+        before, after = (evaluate(holdout, v, latency=latency, substeps=substeps) for v in (first, values))
+    notes = [_GROUP.format(", ".join(group)) for group in unidentifiable]
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
-    notes += _notes(log, latency, latencies, plausible, before, after)
+    if len(latencies) > 1 and latency == max(latencies):
+        notes.append("latency is the largest that was tried: try more")
+    if latency not in plausible:
+        others = ", ".join(map(str, plausible))
+        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
+    speed = np.gradient(log.position)
+    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
+        notes.append("the joint went one way only: friction and offsets are not apart")
+    if after > 0.9 * before:
+        errors = f"{1e3 * before:.2f} to {1e3 * after:.2f} mrad"
+        notes.append(f"hold-out error hardly fell ({errors}): the fit is of little use")
     return Identification(
         joint=log.name,
         values=values,
         fitted=fitted,
-        intervals=intervals,
-        correlation=correlation,
+        intervals={name: (float(a), float(b)) for name, a, b in zip(fitted, least, largest, strict=True)},
         latency=latency,
         latency_plausible=plausible,
         timestep=search.timestep,
         unidentifiable=unidentifiable,
         at_bound=at_bound,
-        rmse=float(rmse[0]),
-        torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
+        rmse=float(rmse),
         holdout_rmse=after,
         holdout_rmse_before=before,
         notes=tuple(notes),
     )
 
 
-def _size(search: Search) -> np.ndarray:
-    """What counts as a relative change of 1 of each fitted parameter."""
-    return np.maximum(np.abs(search.theta), search.typical)[: search.count]
-
-
-def _intervals(
-    search: Search, residual: np.ndarray
-) -> tuple[dict[str, tuple[float, float]], np.ndarray, tuple[tuple[str, ...], ...]]:
-    """Intervals and correlation [P, P] of the fitted parameters, and groups that are not separated.
-
-    From the curvature at the best point, widened by what was seen to fit as well farther off.
-    """
-    theta, count, size = search.theta[: search.count], search.count, _size(search)
-    jacobian = search.jacobian(search.theta, search.starts)
-    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
-    sizes = np.append(size, np.full(len(search.starts), 0.05))
-    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
-    half, correlation = half[:count], correlation[:count, :count]
-    null = [members[:count] for members in null if np.any(members[:count])]
-    least, largest = search.plausible()
-    low = np.maximum(np.minimum(theta - half, least[:count]), search.low[:count])
-    high = np.minimum(np.maximum(theta + half, largest[:count]), search.high[:count])
-    if search.dead_band is not None:
-        first, last = search.dead_band_profile(search.dead_band)
-        low[-1], high[-1] = min(first, low[-1]), max(last, high[-1])
-    fitted = search.names[:count]
-    intervals = {name: (float(a), float(b)) for name, a, b in zip(fitted, low, high, strict=True)}
-    return intervals, correlation, _groups(fitted, null, correlation, half, size)
+def _groups(
+    names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray, vague: np.ndarray
+) -> tuple[tuple[str, ...], ...]:
+    """Groups of parameters that the data do not separate, or see."""
+    sets = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
+    inside = {name for group in sets for name in group}
+    for i in np.flatnonzero(vague):
+        mates = np.abs(correlation[i]) > _CORRELATED  # It is one of them.
+        sets.append(() if names[i] in inside else tuple(n for n, m in zip(names, mates, strict=True) if m))
+    return tuple(dict.fromkeys(group for group in sets if group))
 
 
 def uncertainty(
@@ -191,10 +184,14 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
+    The widest of three intervals counts: that of independent residuals, and jackknives over the segments and over equal
+    stretches of time. What the model gets wrong differs from signal to signal, and residuals that follow each other go
+    together.
+
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
       size: [P], what counts as a relative change of 1.
-      segment: [T] int, parts of the log that began at rest; residuals of one part belong together.
+      segment: [T] int, parts of the log that began at rest.
 
     Returns:
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
@@ -205,78 +202,23 @@ def uncertainty(
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
     inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    freedom = max(len(residual) - len(size), 1)
-    white = inverse * np.sum(residual**2) / freedom
-    score = (relative * residual[:, None]).reshape(-1, len(segment), len(size)).sum(0)
-    robust = inverse @ _long_run(score) @ inverse * len(residual) / freedom
-    # Whichever is larger: the robust one is itself a guess and falls short in half of all cases.
-    half = _NORMAL * np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
-    half = np.maximum(half, _between_segments(relative, score, segment)) * size
-    spread = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    correlation = white / np.outer(spread, spread)
+    covariance = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    half = _NORMAL * spread
+    for group in (segment, np.arange(len(segment)) * _PARTS // len(segment)):
+        if len(np.unique(group)) >= LEAST_PRESSES:
+            own = np.tile(group, len(residual) // len(group))
+            half = np.maximum(half, jackknife(relative, relative, residual, own))
+    half = half * size
+    correlation = covariance / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
 
 
-def _between_segments(relative: np.ndarray, score: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Half of the 95 % intervals [P] by the jackknife over segments, one Newton step each.
-
-    What the model gets wrong differs from signal to signal, which no autocorrelation shows.
-    """
-    rows = relative.reshape(-1, len(segment), relative.shape[1])
-    parts = [np.einsum("ctp,ctq->pq", rows[:, segment == k], rows[:, segment == k]) for k in np.unique(segment)]
-    count, whole = len(parts), np.sum(parts, 0)
-    if count < _LEAST_GROUPS:
-        return np.zeros(len(whole))
-    scores = [score[segment == k].sum(0) for k in np.unique(segment)]
-    moved = [
-        np.linalg.pinv(whole - part, rcond=_NULL**2, hermitian=True) @ own
-        for part, own in zip(parts, scores, strict=True)
-    ]
-    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
-
-
-def _groups(
-    names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray, half: np.ndarray, size: np.ndarray
-) -> tuple[tuple[str, ...], ...]:
-    """Which parameters the data do not separate, or do not see."""
-    sets = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
-    inside = {name for group in sets for name in group}
-    for i, first in enumerate(names):
-        if first in inside:
-            continue
-        mates = [j for j in range(len(names)) if j != i and abs(correlation[i, j]) > _CORRELATED]
-        vague = half[i] > _NORMAL * _VAGUE * size[i]
-        if vague and mates:
-            sets.append(tuple(sorted({first, *(names[j] for j in mates)}, key=names.index)))
-        elif vague:
-            sets.append((first,))
-    return tuple(dict.fromkeys(sets))
-
-
-def _notes(
-    log: JointLog, latency: int, latencies: tuple[int, ...], plausible: tuple[int, ...], before: float, after: float
-) -> list[str]:
-    notes = []
-    if len(latencies) > 1 and latency == max(latencies):
-        notes.append("latency is the largest that was tried: try more")
-    if latency not in plausible:
-        others = ", ".join(map(str, plausible))
-        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
-    speed = np.gradient(log.position)
-    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1:
-        notes.append("the joint went one way only: friction and offsets are not apart")
-    if np.isfinite(after) and after > 0.9 * before:
-        notes.append(
-            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
-        )
-    return notes
-
-
-def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> tuple[float, float]:
-    """Root mean square errors of the angle, rad, and of the torque, Nm (NaN without), on a log.
+def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> float:
+    """Root mean square error rad of the angle on a log.
 
     Where the joint rests, the simulation begins anew from the angle in the log (`segments`).
     """
@@ -284,10 +226,8 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
     full = with_defaults(dict(values), log)
     full["start"] = jnp.asarray(angle[segment], jnp.float32) - full["encoder_bias"]
     timestep, target = jnp.float32(log.period / substeps), jnp.asarray(log.target, jnp.float32)
-    position, torque = simulate(full, target, jnp.int32(latency), timestep, substeps, segment)
-    measured = np.nan if log.torque is None else log.torque
-    angle_error, torque_error = np.asarray(position, float) - log.position, np.asarray(torque, float) - measured
-    return float(np.sqrt(np.mean(angle_error**2))), float(np.sqrt(np.mean(torque_error**2)))
+    position, _ = simulate(full, target, jnp.int32(latency), timestep, substeps, segment)
+    return float(np.sqrt(np.mean((np.asarray(position, float) - log.position) ** 2)))
 
 
 def check_log(log: JointLog) -> None:
@@ -296,55 +236,15 @@ def check_log(log: JointLog) -> None:
     Raises:
       CalibrationError: too short, not numbers, another unit, no motion, saturated throughout.
     """
-    channels = [log.target, log.position] + ([] if log.torque is None else [log.torque])
-    shapes = [np.shape(channel) for channel in channels]
-    if len(set(shapes)) > 1 or len(shapes[0]) != 1 or shapes[0][0] < MIN_SAMPLES:
-        raise CalibrationError(
-            f"{log.name}: got {', '.join(map(str, shapes))}; expected arrays of one length, at least {MIN_SAMPLES} "
-            "samples of chirp, steps, slow triangles and small reversals"
-        )
-    if not np.all(np.isfinite(channels)):
-        raise CalibrationError(
-            f"{log.name}: a sample is not a number: cut the log there, samples must follow each other without gaps"
-        )
+    channels = {"target": (log.target, "rad"), "position": (log.position, "rad")}
+    if log.torque is not None:
+        channels["torque"] = log.torque, "Nm"
+    check_signals(log.name, MIN_SAMPLES, channels, *_SATURATED)
     if not 1e-4 <= log.period <= 0.2:
         raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 to 0.2")
-    largest = max(np.abs(log.position).max(), np.abs(log.target).max())
-    if largest > 2 * np.pi:
-        raise CalibrationError(f"{log.name}: angles of {largest:.3g}: give rad, not degrees or counts")
     moved, commanded = np.ptp(log.position), np.ptp(log.target)
-    if min(moved, commanded) < MIN_MOTION or not 1 / 20 < moved / commanded < 20:
+    if min(moved, commanded) < MIN_MOTION or not commanded / 20 < moved < 20 * commanded:
         raise CalibrationError(
             f"{log.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of "
             "motion is needed, target and position in the same unit"
         )
-    size = np.zeros(1) if log.torque is None else np.abs(log.torque)
-    if size.max() > 50.0:
-        raise CalibrationError(f"{log.name}: torque of {size.max():.3g} Nm: give Nm")
-    if log.torque is not None and np.mean(size > 0.97 * size.max()) > 0.6:
-        raise CalibrationError(
-            f"{log.name}: torque sits at {size.max():.3g} Nm in most samples: saturated, give smaller commands"
-        )
-
-
-def _long_run(score: np.ndarray) -> np.ndarray:
-    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T: Newey-West on the series without
-    its first-order autoregression (Andrews and Monahan 1992), bandwidth after Andrews 1991."""
-    count = len(score)
-    rho = _autocorrelation(score)
-    white = score[1:] - rho * score[:-1]
-    left = _autocorrelation(white)
-    alpha = float(np.max(4 * left**2 / ((1 - left) * (1 + left)) ** 2))
-    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)) + 1, count // 4)
-    total = white.T @ white
-    for lag in range(1, lags + 1):
-        cross = white[lag:].T @ white[:-lag]
-        total += (1.0 - lag / (lags + 1)) * (cross + cross.T)
-    return total / np.outer(1.0 - rho, 1.0 - rho) * count / (count - 1)
-
-
-def _autocorrelation(series: np.ndarray) -> np.ndarray:
-    """First-order coefficient [P] of each column, corrected for its bias in short series. Correlation over more than a
-    quarter of the series is not to be told from a trend."""
-    rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
-    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))

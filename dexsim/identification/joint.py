@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,7 @@ from dexsim.actuator.drive import Actuator, apply_friction, joint_torque, pd_tor
 from dexsim.core.errors import CalibrationError
 
 
-@dataclasses.dataclass(frozen=True)
-class Parameter:
+class Parameter(NamedTuple):
     """A parameter of the joint, in its unit."""
 
     unit: str
@@ -135,26 +135,18 @@ def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarra
     position = np.asarray(log.position, float)
     noise = 1.4826 * np.median(np.abs(np.diff(position, 2))) / np.sqrt(6) + 1e-5
     changes = np.flatnonzero(np.diff(log.target) != 0) + 1
-    firsts = [0]
-    for change in changes:
+    firsts, angles = [0], [np.mean(position[: min(changes[0], before)])]
+    for last, change in zip([0, *changes[:-1]], changes, strict=True):
         first = change - before
-        still = first >= 0 and np.all(log.target[first:change] == log.target[first])
-        if not still or first - firsts[-1] < least or len(position) - first < least:
+        if last > first or first - firsts[-1] < least or len(position) - first < least:
             continue
-        half = before // 2
-        drift = np.mean(position[first : first + half]) - np.mean(position[change - half : change])
-        if abs(drift) < 4.0 * noise / np.sqrt(half / 2):
+        early, late = position[first:change].reshape(2, -1).mean(1)
+        if abs(early - late) < 4.0 * noise / np.sqrt(before / 4):
             firsts.append(int(first))
+            angles.append(np.mean(position[first:change]))
     segment = np.zeros(len(position), np.int32)
     segment[firsts[1:]] = 1
-    angles = [np.mean(position[first : first + max(_still(log, first, before), 1)]) for first in firsts]
     return np.cumsum(segment, dtype=np.int32), np.array(angles)
-
-
-def _still(log: JointLog, first: int, limit: int) -> int:
-    """Samples from `first` on, at most `limit`, whose target is the same."""
-    same = log.target[first : first + limit] == log.target[first]
-    return int(np.argmin(np.append(same, False)))
 
 
 def with_defaults(values: Mapping[str, float], log: JointLog) -> dict[str, jax.Array]:

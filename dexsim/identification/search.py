@@ -264,7 +264,9 @@ class Search:
         for _ in range(rounds):
             tries = rng.multivariate_normal(middle, spread, crowd)
             tries = np.clip(tries, self.low[:count] / scale, self.high[:count] / scale)
-            tries[0] = middle
+            tries[: 2 * count + 1] = middle
+            for end, bound in enumerate((self.low, self.high)):  # Where a limit binds hardly ever, curvature misleads.
+                tries[1 + end * count :][range(count), range(count)] = bound[:count] / scale
             thetas = np.tile(self.theta, (crowd, 1))
             thetas[:, :count] = tries * scale
             costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)

@@ -53,7 +53,7 @@ def read_log(path: Path, hand: str = "") -> Episodes:
       DexsimError: the policy never ran in it.
     """
     from dexsim.geometry import rotations
-    from dexsim_real.replay.replay import replay
+    from dexsim_real.replay import replay
 
     run = replay(path, hand)
     if not run.ticks:

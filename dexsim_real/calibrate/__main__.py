@@ -9,16 +9,14 @@ output is written at the end, complete or not at all. `--from-log FILE` fits rec
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from dexsim import load_hand
-from dexsim.calibration.maps import save_calibration
+from dexsim.calibration.maps import Calibration, save_calibration, torque_constants
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.description import Hand
@@ -26,7 +24,7 @@ from dexsim_real.calibrate.bench import Bench, Operator
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.calibrate.press_fit import Fit, fit, torque_constant_intervals, torque_constants
+from dexsim_real.calibrate.press_fit import JointFit, fit
 from dexsim_real.calibrate.procedure import PressProcedure
 from dexsim_real.calibrate.read import read_presses
 from dexsim_real.control.controller import prepare_jax
@@ -70,52 +68,39 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     Raises:
       DexsimError: the recordings are insufficient, or a file cannot be written.
     """
-    result = fit(*read_presses(logs, hand), hand)
-    operator.console.print(table(result, hand))
-    for note in grouped(result.calibration.notes):
-        operator.tell(f"note: {note}")
+    calibration, joints = fit(*read_presses(logs, hand), hand)
+    for line in (*table(calibration, joints, hand), *(f"note: {note}" for note in calibration.notes)):
+        operator.tell(line)
     output = arguments.destination
     if output.exists() and not arguments.force:  # It may have been created meanwhile.
         raise HandError(
             f"{output} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another"
         )
-    save_calibration(output, result.calibration)
+    save_calibration(output, calibration)
     operator.tell(f"calibration: {output}")
     if arguments.plot:
-        plot_calibration(arguments.plot, result.calibration, result.real, result.sim)
+        real, sim = ({name: getattr(found, side) for name, found in joints.items()} for side in ("real", "sim"))
+        plot_calibration(arguments.plot, calibration, real, sim)
         operator.tell(f"figure: {arguments.plot}")
 
 
-def table(fit: Fit, hand: Hand) -> Table:
-    """A table with one row per joint. A cell has loading / unloading, or the worse of the two."""
-    calibration, real = fit.calibration, fit.calibration.real
-    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
-    width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
-    heads = ("joint", "pressed with", "Nm / A", "95 %", "R2", "friction", "max force", "tip N / Nm")
-    rows = Table(*heads, box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading")
+def table(calibration: Calibration, joints: Mapping[str, JointFit], hand: Hand) -> list[str]:
+    """Lines of a table with one row per joint. A cell has loading / unloading, or the worse of the two."""
+    real, (constants, errors) = calibration.real, torque_constants(calibration)
     assert calibration.force_per_torque is not None, "`press_fit.fit` gives it"
     tip = dict(zip(hand.root_joint.tolist(), calibration.force_per_torque[0], strict=True))
+    rows = [f"{'joint':15}{'pressed with':14}{'Nm / A':>15}{'95 %':>9}  R2     friction  max force  tip N / Nm"]
     for joint, name in enumerate(calibration.joint_names):
-        rows.add_row(
-            name,
-            fit.source.get(name, "(others)"),
-            " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
-            f"{100 * width[joint]:.1f} %",
-            f"{np.min(real.r_squared[:, joint]):.3f}",
-            f"{1e3 * real.friction[joint]:.0f} mA",
-            f"{real.force_max[joint]:.1f} N",
-            f"{tip[joint]:.1f}" if tip.get(joint) else "",
+        loading, unloading = constants[:, joint]
+        width = 100 * np.max(errors[:, joint] / np.abs(constants[:, joint]))
+        pressed = joints[name].press if name in joints else "(others)"
+        rows.append(
+            f"{name:15}{pressed:14}{loading:+.3f} / {unloading:+.3f}"
+            f"{width:7.1f} %  {np.min(real.r_squared[:, joint]):.3f}"
+            f"{1e3 * real.friction[joint]:6.0f} mA{real.force_max[joint]:9.1f} N"
+            f"{f'{tip[joint]:10.1f}' if tip.get(joint) else ''}"
         )
     return rows
-
-
-def grouped(notes: tuple[str, ...]) -> list[str]:
-    """Notes, with equal notes on several joints joined."""
-    joined: dict[str, list[str]] = {}
-    for note in notes:
-        name, colon, text = note.partition(": ")
-        joined.setdefault(text if colon else note, []).append(name if colon else "")
-    return [f"{', '.join(names)}: {text}" if names[0] else text for text, names in joined.items()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -132,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_jax()
     cli.enable_caches()
     hand = load_hand(arguments.hand or None)
-    operator = Operator(Console(stderr=True), assume_yes=arguments.yes)
+    operator = Operator(sys.stderr, assume_yes=arguments.yes)
     if arguments.identify:
         identify_hand(arguments, hand, operator)
     else:

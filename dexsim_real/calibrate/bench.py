@@ -12,22 +12,20 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from rich.console import Console
 
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.description import Hand
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.control.motors_off import UNCONFIRMED
 from dexsim_real.control.policy_loop import smooth
-from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
-from dexsim_real.loop import Exchange, ExchangeLoop
+from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire.link import HandPort
+from dexsim_real.wire.link import UNCONFIRMED, HandPort
 from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
@@ -40,18 +38,18 @@ class Operator:
     """The person beside the hand.
 
     Args:
-      console: for output.
+      out: for output.
       assume_yes: ask nothing and assume that every answer is yes.
       stream: of the answers; None is the standard input.
     """
 
-    def __init__(self, console: Console, *, assume_yes: bool = False, stream: TextIO | None = None):
-        self.console, self.assume_yes = console, assume_yes
+    def __init__(self, out: TextIO, *, assume_yes: bool = False, stream: TextIO | None = None):
+        self.out, self.assume_yes = out, assume_yes
         self._stream = stream or sys.stdin or io.StringIO()  # Python has no `sys.stdin` where it was closed.
 
     def tell(self, text: str) -> None:
         """Print one line."""
-        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print(text, file=self.out, flush=True)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.
@@ -151,11 +149,10 @@ class Bench(ExchangeLoop):
             calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
             for line in self.port.greet(hand, calibration):
                 self._say(line)
-            identity = self.port.identity
             meta = {
                 "task": self._task,
-                "serial": identity.serial_number if identity else "",
-                "handedness": identity.handedness if identity else "",
+                "serial": self.port.identity.serial_number,
+                "handedness": self.port.identity.handedness,
                 "hardware": to_dict(arguments.hardware),
                 "safety": to_dict(arguments.safety),
                 "press": to_dict(arguments.press),
@@ -183,15 +180,15 @@ class Bench(ExchangeLoop):
                 leave_realtime()
         if error is None and self.driven:
             raise HandError(f"{UNCONFIRMED}: press the emergency stop")
-        if error is None and (self.log.dropped or self.log.failure):
-            raise HandError(f"{self.log.dropped} log records are lost ({self.log.failure or 'the disk is too slow'})")
+        if error is None and self.log.losses:
+            raise HandError(self.log.losses)
 
-    def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> Exchange | None:
+    def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> HandSample | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
 
         Args:
           target: [J] rad, requested joint targets; None keeps the last ones.
-          mark: annotation with which an exchange that is not None is logged.
+          mark: annotation with which a sample that is not None is logged.
 
         Raises:
           HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
@@ -199,17 +196,16 @@ class Bench(ExchangeLoop):
         now = self.clock()
         if target is not None:
             self.safety.set_target(target, now)
-        decision, command = self.request()
-        exchange = self.take(decision, self.port.exchange(command))
-        answer = b"" if exchange is None else exchange.state.tobytes()
-        self._newest = {"sent": now, "command": command.tobytes(), "answer": answer}
-        self._check(now, exchange)
+        sample = self.cycle()
+        answer = b"" if sample is None else sample.state.tobytes()
+        self._newest = {"sent": now, "command": self.command.tobytes(), "answer": answer}
+        self._check(now, sample)
         self.pace.wait()
-        if exchange is None or not exchange.plausible:
+        if sample is None or self.safety.problem:
             return None
         if mark:
             self.annotate(mark)
-        return exchange
+        return sample
 
     def annotate(self, mark: dict[str, Any]) -> None:
         """Log the newest exchange with an annotation."""
@@ -217,23 +213,23 @@ class Bench(ExchangeLoop):
 
     def collect(
         self, seconds: float, target: np.ndarray | None = None, mark: dict[str, Any] | None = None
-    ) -> list[Exchange]:
-        """The answered exchanges of this duration in s; arguments and errors as for `step`, or none was answered."""
-        until, exchanges = self.clock() + seconds, []
+    ) -> list[HandSample]:
+        """The samples of this duration in s; arguments and errors as for `step`, or there is none."""
+        until, samples = self.clock() + seconds, list[HandSample]()
         while self.clock() < until:
-            exchanges.append(self.step(target, mark))
-        answered = [exchange for exchange in exchanges if exchange is not None]
-        if not answered:
+            sample = self.step(target, mark)
+            samples += [sample] if sample is not None else []
+        if not samples:
             raise HandError(f"no usable answer in {seconds:g} s; check the cable")
-        return answered
+        return samples
 
-    def set_zero(self, exchanges: list[Exchange]) -> None:
-        """Tare the taxels with exchanges of an untouched hand.
+    def set_zero(self, samples: list[HandSample]) -> None:
+        """Tare the taxels with samples of an untouched hand.
 
         Raises:
           HandError: something touches a fingertip, or a taxel is stuck.
         """
-        if stuck := self.sensing.set_tare([exchange.state for exchange in exchanges]):
+        if stuck := self.sensing.set_tare([sample.state for sample in samples]):
             raise HandError(f"{'; '.join(stuck)}; power-cycle the hand")
         self.log.add(Kind.META, {"tare": self.sensing.tare})
         self.step()  # What `Safety` has seen so far was not tared.
@@ -253,18 +249,18 @@ class Bench(ExchangeLoop):
             self.step(smooth(start, goal, share))
         self.step(goal)
 
-    def _check(self, now: float, exchange: Exchange | None) -> None:
+    def _check(self, now: float, sample: HandSample | None) -> None:
         safety = self.safety
         if safety.latched:
             raise HandError(f"stopped: {safety.latched}")
         if self.log.failure:
             raise HandError(f"stopped: the log is lost ({self.log.failure})")
-        if exchange is not None:
-            if self._connection not in (None, exchange.sample.generation):
+        if sample is not None:
+            if self._connection not in (None, sample.generation):
                 raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
-            self._connection = exchange.sample.generation
+            self._connection = sample.generation
         reaction, reason = safety.last
-        working = exchange is not None and (reaction <= Reaction.CLIP or not safety.engaged)
+        working = sample is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now
         if self._failing_since is not None and now - self._failing_since > _PATIENCE:
             why = safety.refused or reason or "the hand does not answer"

@@ -17,7 +17,7 @@ from dexsim.calibration.maps import Calibration, joint_torque, load_calibration
 from dexsim.core import cli
 from dexsim.core.errors import DexsimError
 from dexsim.hand.description import Hand
-from dexsim.identification.excitation import Excitation, excitation
+from dexsim.identification.excitation import excitation
 from dexsim.identification.identify import Identification, identify
 from dexsim.identification.joint import JointLog
 from dexsim_real.calibrate.bench import Bench, Operator
@@ -36,7 +36,7 @@ Marks = list[dict[str, Any]]
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
 _SIGNALS: dict[str, dict[str, Any]] = {
     "fit": {},
-    "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
+    "hold-out": {"amplitude": 0.2, "frequency": (0.5, 2.5), "seconds": 3.0, "steps": 3},
 }
 _TIMESTEP = 0.006  # s, about that of the simulation
 _TARE = 0.5  # s
@@ -103,7 +103,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     posture[:4] = 0.5, 0.4, 0.5, 0.0
     posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     signals = {
-        label: excitation(hand, Excitation(period=period, **options), posture, arguments.joints or None)
+        label: excitation(hand, period, posture, arguments.joints or None, **options)
         for label, options in _SIGNALS.items()
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())

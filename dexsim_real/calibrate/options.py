@@ -7,8 +7,7 @@ from dexsim.core import cli
 from dexsim.core.config import Config, setting
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.wire.link import LinkConfig
+from dexsim_real.loop import LoopOptions
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +31,7 @@ class PressConfig(Config):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CalibrateArguments(Config):
+class CalibrateArguments(LoopOptions):
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None
@@ -68,16 +67,10 @@ class CalibrateArguments(Config):
     """Image file for the figure (.png, .pdf or .svg); None draws no figure."""
     log: Path | None = None
     """Log file; None for a new file in runs/real."""
-    rate: float = setting(83.0, unit="Hz", low=20.0, high=1000.0)
-    """Exchanges with the hand per second."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
     press: PressConfig = setting(PressConfig())
     """Presses."""
-    link: LinkConfig = setting(LinkConfig())
-    """The serial line."""
-    hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains of the hand."""
     safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15, stall_current=1.8))
     """Safety limits. Presses hold still at currents that a run need not hold."""
 

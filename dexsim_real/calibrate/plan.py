@@ -79,7 +79,7 @@ def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict
         posture[hand.joint_names.index(_SPREADS)] = 0.0
     posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     posture[list(bent)] = list(bent.values())
-    arms = np.mean([lever_arms(hand, posture, finger, taxel) for taxel in taxels], 0)
+    arms = lever_arms(hand, posture, finger, np.isin(np.arange(hand.num_taxels), taxels) / len(taxels))
     longest = np.max(np.abs(arms))
     joints = np.flatnonzero(np.abs(arms) > _SHARE * longest)
     direction = np.zeros(hand.num_joints)

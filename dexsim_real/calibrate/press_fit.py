@@ -1,6 +1,6 @@
 """Fits a calibration to recorded presses: forces and lever arms of the taxels, one robust line per joint and direction.
 
-The torque that the simulation would report is computed from the same recording: the force of every taxel times its
+The torque that the simulation would report is computed from the same recording: the force of the taxels times its
 lever arm at the measured joint angles (J^T f, with the kinematics of the simulation). The exact place of the contact on
 the fingertip does not matter.
 
@@ -13,23 +13,18 @@ the motors' temperature.
 """
 
 import dataclasses
-import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, median_filter
 
-from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import MIN_SAMPLES, JointPress
+from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
-from dexsim.calibration.maps import Calibration, Side
-from dexsim.calibration.press import MIN_LEVER
+from dexsim.calibration.maps import Calibration
+from dexsim.calibration.press import MIN_LEVER, contact_jacobian
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, TOUCHED, UNLOADING
 from dexsim_real.calibrate.read import Recording, Source
 from dexsim_real.sensors.taxels import around, taxel_names
@@ -44,7 +39,6 @@ _SHEAR = 0.1  # share of the force above which shear is noted
 _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
 
 _ACTIVE = 2.0  # counts above which a taxel takes part
-_NEIGHBOURS = 3.0  # counts, mean of a taxel's neighbours above which it must read something
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
 _GAUGE = 0.03  # of the gauge itself, and of how straight it stands under a fingertip that turns by up to 0.25 rad
@@ -52,25 +46,25 @@ _PLACE = 0.08  # between places on a fingertip, whose taxels differ
 _NOMINAL = 0.25  # of the taxels without a gauge
 _OTHERS = 0.35  # of a fingertip without a gauge from those with one
 
-METHOD = (
-    f"the intervals contain the method's own error: {1e3 * _LEVER:g} mm of lever arm and {100 * _HEAT:g} % for warm "
-    "motors; on emulated hands of known truth the torque constants came out about 2 % low, since presses warm "
-    "the motors and the taxels put the contact too near the joint (thumb_bend 6 %)"
-)
-"""Note of every calibration."""
 
-
-@dataclasses.dataclass(frozen=True)
-class Blocks:
+class Blocks(NamedTuple):
     """A press averaged over B blocks of a quarter of a second."""
 
     counts: np.ndarray  # [B, N] of the taxels that take part, 0 of the others
+    shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
     current: np.ndarray  # [B, J] A
     position: np.ndarray  # [B, J] rad
     speed: np.ndarray  # [B, J] rad/s
-    shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
     run: np.ndarray  # [B] number of the loading or unloading phase
     press: np.ndarray  # [B] number of the press, up and down
+
+
+class Scale(NamedTuple):
+    """Newtons of a press's taxel counts: gain * counts + offset."""
+
+    gain: float
+    offset: float
+    error: float  # share of the gain, 95 %
 
 
 class JointFit(NamedTuple):
@@ -82,91 +76,66 @@ class JointFit(NamedTuple):
     sim: JointPress
 
 
-@dataclasses.dataclass(frozen=True)
-class ForceScale:
-    """Newtons of taxel counts."""
-
-    per_count: np.ndarray  # [F] N, for a run
-    newtons: dict[str, tuple[float, float]]  # by press: gain and offset, newtons = gain * counts + offset
-    error: dict[str, float]  # by press: share of the gain, 95 %
-    gauged: bool  # whether a finger had gauge readings
-    notes: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """A calibration, and the data that it was fitted to."""
-
-    calibration: Calibration
-    real: dict[str, JointPress]
-    sim: dict[str, JointPress]
-    source: dict[str, str]  # press that each joint was fitted to
-
-
-def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand, created: str | None = None) -> Fit:
-    """Fit a calibration to all recorded presses; `created` is its date, by default now.
+def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tuple[Calibration, dict[str, JointFit]]:
+    """Fit a calibration to all recorded presses; and what each joint was fitted to, the press with its longest lever.
 
     Raises:
       CalibrationError: recordings are missing or unusable.
     """
     blocks, notes = {}, list[str]()
     for name, recording in recordings.items():
-        if not len(recording.samples(LOADING, UNLOADING)):
+        if not recording.at(LOADING, UNLOADING).any():
             continue
-        part = make_blocks(recording, hand.taxel_grid)
+        part = make_blocks(recording, hand)
         if part.counts.sum() > 0:
             blocks[name] = part
         else:  # Without force no lever arm.
             notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
-    scale = force_scale(source, hand, [recordings[name] for name in blocks])
-    best = dict[str, JointFit]()  # by joint: of the press with the longest lever arm
+    per_count, scales, scale_notes = force_scale(source, hand, [recordings[name] for name in blocks])
+    joints = dict[str, JointFit]()
     for name, part in blocks.items():
-        for label, joint_fit in _press(hand, recordings[name], part, scale, notes).items():
-            if label not in best or joint_fit.lever > best[label].lever:
-                best[label] = joint_fit
-    real, sim = {j: f.real for j, f in best.items()}, {j: f.sim for j, f in best.items()}
-    identity = source.identity
+        for label, found in _press(hand, recordings[name], part, scales[name], notes).items():
+            if label not in joints or found.lever > joints[label].lever:
+                joints[label] = found
     try:
         calibration = calibrate(
             hand,
-            real,
-            sim,
-            force_per_count=scale.per_count,
-            serial=identity.serial_number,
-            handedness=identity.handedness,
-            created=created,
+            {label: found.real for label, found in joints.items()},
+            {label: found.sim for label, found in joints.items()},
+            force_per_count=per_count,
+            serial=source.identity.serial_number,
+            handedness=source.identity.handedness,
         )
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from None
-    # With a gauge the absolute scale is known.
-    own = [note for note in calibration.notes if not (scale.gauged and note.startswith("only the ratio"))]
     calibration = dataclasses.replace(
         calibration,
-        force_per_torque=_force_per_torque(hand, calibration, real),
-        notes=(*own, METHOD, *scale.notes, *notes),
+        force_per_torque=_force_per_torque(hand, calibration, joints),
+        notes=(*calibration.notes, *scale_notes, *notes),
     )
-    return Fit(calibration, real, sim, {label: joint_fit.press for label, joint_fit in best.items()})
+    return calibration, joints
 
 
-def _press(hand: Hand, recording: Recording, part: Blocks, scale: ForceScale, notes: list[str]) -> dict[str, JointFit]:
+def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: list[str]) -> dict[str, JointFit]:
     """What one press says of each of its joints; of what it does not, it adds notes."""
-    name, (gain, offset) = recording.name, scale.newtons[recording.name]
+    name, finger = recording.name, recording.finger
     dead = dead_taxels(hand, part.counts)
     counts = fill_dead(hand, part.counts, dead)
-    force = counts.sum(-1) * gain + offset
-    torque = taxel_torque(hand, part.position, recording.finger, counts * gain)
-    high = force > 0.5 * force.max()
-    lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
-    # Shear over normal force by the taxels, and the torque by it over the force.
     sums = counts.sum(-1)
+    force = sums * scale.gain + scale.offset
+    # All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
+    # fingertip is the sum over its taxels, as in simulation.
+    shares = counts / np.maximum(sums, 1e-9)[:, None]
+    contacts = [contact_jacobian(hand, at, finger, share) for at, share in zip(part.position, shares, strict=True)]
+    arms = np.array([normal @ jacobian for normal, jacobian in contacts])  # [B, J] m
     firm = sums > 0.5 * sums.max()
+    lever = np.average(arms[firm], 0, weights=sums[firm])
+    # Shear over normal force by the taxels, and the longest lever arms of a force along the skin.
     shear = float(np.median(np.linalg.norm(part.shear[firm], axis=-1) / sums[firm]))
-    posture, weight = (v.astype(np.float32) for v in (part.position[high].mean(0), counts.sum(0) / counts.sum()))
-    slip = shear * np.asarray(_along_skin(hand, np.int32(recording.finger), posture, weight))
-    # The force that the gauge adds to the taxels' sum acts at the same place.
-    torque += offset * lever
+    normal, jacobian = contact_jacobian(hand, part.position[firm].mean(0), finger, counts.sum(0) / counts.sum())
+    slip = shear * np.linalg.norm(jacobian - np.outer(normal, normal @ jacobian), axis=0)
     fits = {}
     for joint in recording.joints:
         label, arm = hand.joint_names[joint], float(abs(lever[joint]))
@@ -184,20 +153,33 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: ForceScale, no
             )
             continue
         # A force read too large makes the gain of the current too small, and leaves the lever arm.
-        known, placed = float(np.hypot(scale.error[name], _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
+        known, placed = float(np.hypot(scale.error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
         real = JointPress(force, part.current[:, joint], way, part.press, known)
-        fits[label] = JointFit(name, arm, real, JointPress(force, torque[:, joint], way, part.press, placed))
-    notes += _press_notes(hand, recording, dead, shear)
+        fits[label] = JointFit(name, arm, real, JointPress(force, force * arms[:, joint], way, part.press, placed))
+    if dead.any():
+        notes.append(
+            f"{hand.finger_names[finger]}: dead: {taxel_names(hand, dead)} read nothing while their "
+            "neighbours were pressed; the fit uses the mean of the neighbours, a run reads zero"
+        )
+    if shear > _SHEAR:
+        notes.append(
+            f"{name}: shear of {100 * shear:.0f} % of the force by the taxels' x and y, which the fit "
+            "ignores; press on something that slides, rolls or is soft"
+        )
+    if not recording.finished:
+        notes.append(f"{name}: was interrupted; the fit has what was pressed until then, press it again")
+    elif (left := np.median(recording.counts[recording.at(RELEASED)].sum(-1))) > TOUCHED:
+        notes.append(f"{name}: {left:.0f} counts remain after the press: the zero drifts")
     return fits
 
 
-def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
+def make_blocks(recording: Recording, hand: Hand) -> Blocks:
     """Average a recording over blocks of time, but for an incomplete block at the end of a phase.
 
     Raises:
       CalibrationError: no phase is long enough.
     """
-    size, phase = max(round(_BLOCK * recording.rate), 1), np.array(recording.phase)
+    size, phase = max(round(_BLOCK * recording.rate), 1), recording.phase
     cuts = [0, *np.flatnonzero(phase[1:] != phase[:-1]) + 1, len(phase)]
     names, runs = [], []
     for first, last in zip(cuts[:-1], cuts[1:], strict=True):
@@ -207,53 +189,20 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
             runs.append(np.array([np.arange(size) + at for at in starts]))
     if not runs:
         raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
-    time, angle = np.array(recording.time), np.array(recording.position)
+    time, angle = recording.time, recording.position
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
     begins = [before == UNLOADING and name == LOADING for before, name in zip([UNLOADING, *names], names, strict=False)]
     rows, lengths = np.concatenate(runs), [len(run) for run in runs]
-    counts = np.array(recording.counts)[rows].mean(1)
-    return Blocks(
-        counts * active_taxels(counts, grid),
-        np.array(recording.current)[rows].mean(1),
-        angle[rows].mean(1),
-        speed,
-        np.array(recording.shear)[rows].mean(1),
-        np.repeat(np.arange(len(runs)), lengths),
-        np.repeat(np.cumsum(begins), lengths),
-    )
-
-
-def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarray) -> np.ndarray:
-    """Joint torques [T, J] Nm that balance taxel forces [T, N] N at joint angles [T, J] rad: J^T f.
-
-    All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
-    fingertip is the sum over its taxels, as in simulation.
-    """
-    samples = zip(position.astype(np.float32), force.astype(np.float32), strict=True)
-    return np.array([_torque(hand, np.int32(finger), at, push) for at, push in samples], float)
-
-
-@functools.partial(jax.jit, static_argnames="hand")
-def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> jax.Array:
-    mean = force @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
-    normal = mean / jnp.maximum(jnp.linalg.norm(mean), 1e-6)
-    return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
-
-
-@functools.partial(jax.jit, static_argnames="hand")
-def _along_skin(hand: Hand, finger: jax.Array, at: jax.Array, weight: jax.Array) -> jax.Array:
-    """Largest lever arms [J] m of a force along the skin at the weighted taxels, at joint angles [J]."""
-    normal = weight @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
-    way = jax.jacfwd(lambda q: weight @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
-    along = (normal / jnp.linalg.norm(normal)) @ way
-    return jnp.sqrt(jnp.maximum(jnp.sum(jnp.square(way), 0) - jnp.square(along), 0.0))
+    parts = (recording.counts, recording.shear, recording.current, angle)
+    counts, shear, current, position = (part[rows].mean(1) for part in parts)
+    run, press = (np.repeat(number, lengths) for number in (np.arange(len(runs)), np.cumsum(begins)))
+    return Blocks(counts * active_taxels(hand, counts), shear, current, position, speed, run, press)
 
 
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
     """Direction [B] of motion of a joint: 1, -1, or 0 at rest."""
-    position = np.array(recording.position)[:, joint]
-    jitter = np.median(np.abs(np.diff(position))) / 0.6745 / np.sqrt(2)
+    jitter = np.median(np.abs(np.diff(recording.position[:, joint]))) / 0.6745 / np.sqrt(2)
     noise = jitter / np.sqrt(max(_BLOCK * recording.rate, 1)) / (np.sqrt(2) * _BLOCK)
     usual = np.quantile(np.abs(speed), 0.75)
     return np.where(np.abs(speed) > max(_STILL * usual, _NOISE * noise), np.sign(speed), 0).astype(int)
@@ -269,7 +218,7 @@ def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     return selected
 
 
-def _force_per_torque(hand: Hand, calibration: Calibration, real: Mapping[str, JointPress]) -> np.ndarray:
+def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str, JointFit]) -> np.ndarray:
     """Force of a fingertip over the torque of its finger's root joint, as a run reads that torque.
 
     A run does not know whether a finger closes or opens: the value is half way between the lines of both directions,
@@ -279,94 +228,57 @@ def _force_per_torque(hand: Hand, calibration: Calibration, real: Mapping[str, J
     Returns:
       [3, F] N/Nm: value, low, high of the 95 % interval; 0 where nothing pressed.
     """
-    ratio = np.zeros((3, hand.num_fingers))
-    per_ampere = np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
-    gains = np.abs(calibration.real.gain * per_ampere)  # [2, J] Nm/N
-    shares = [np.max((side.gain_high - side.gain_low) / 2 / np.abs(side.gain), 0) for side in _sides(calibration)]
+    ratio, real, sim = np.zeros((3, hand.num_fingers)), calibration.real, calibration.sim
+    gains = np.abs(real.gain * np.mean(sim.gain, 0) / np.mean(real.gain, 0))  # [2, J] Nm/N
+    by_press, by_lever = (np.max(side.gain_error / np.abs(side.gain), 0) for side in (real, sim))
     for finger, joint in enumerate(hand.root_joint):
         name, gain = hand.joint_names[joint], gains[:, joint]
-        if name not in real:
+        if name not in joints:
             continue
-        presses = np.sqrt(max(shares[0][joint] ** 2 - real[name].gain_error ** 2, 0.0))
-        share = np.hypot(presses, shares[1][joint])
-        middle, half = gain.mean(), float(np.hypot(share * gain.mean(), np.ptp(gain) / 2))
+        presses = max(by_press[joint] ** 2 - joints[name].real.gain_error ** 2, 0.0)
+        middle, share = gain.mean(), np.hypot(np.sqrt(presses), by_lever[joint])
+        half = float(np.hypot(share * middle, np.ptp(gain) / 2))
         if half < middle:
             ratio[:, finger] = 1.0 / np.array([middle, middle + half, middle - half])
     return ratio
 
 
-def _sides(calibration: Calibration) -> tuple[Side, Side]:
-    return calibration.real, calibration.sim
-
-
-def _press_notes(hand: Hand, recording: Recording, dead: np.ndarray, shear: float) -> list[str]:
-    """Notes on dead taxels, shear, drift and interruption of one press."""
-    notes = []
-    if dead.any():
-        notes.append(
-            f"{hand.finger_names[recording.finger]}: dead: {taxel_names(hand, dead)} read nothing while their "
-            "neighbours were pressed; the fit uses the mean of the neighbours, a run reads zero"
-        )
-    if shear > _SHEAR:
-        notes.append(
-            f"{recording.name}: shear of {100 * shear:.0f} % of the force by the taxels' x and y, which the fit "
-            "ignores; press on something that slides, rolls or is soft"
-        )
-    left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
-    if not recording.finished:
-        notes.append(f"{recording.name}: was interrupted; the fit has what was pressed until then, press it again")
-    elif np.median(left) > TOUCHED:
-        notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
-    return notes
-
-
-def torque_constants(calibration: Calibration) -> np.ndarray:
-    """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
-    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
-
-
-def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
-    """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
-    value = torque_constants(calibration)
-    real, sim = (np.asarray((side.gain_high - side.gain_low) / 2 / np.abs(side.gain)) for side in _sides(calibration))
-    share = np.hypot(real, sim)
-    return value[..., None] + (np.abs(value) * share)[..., None] * np.array([-1.0, 1.0])
-
-
 # --- scale of the force --------------------------------------------------------------------------
 
 
-def force_scale(source: Source, hand: Hand, pressed: list[Recording]) -> ForceScale:
+def force_scale(
+    source: Source, hand: Hand, pressed: Iterable[Recording]
+) -> tuple[np.ndarray, dict[str, Scale], list[str]]:
     """Compare the taxels with the gauge. A press without readings uses those of the finger's other press.
+
+    Returns:
+      Newtons of a count [F] for a run, the scale of each press, and notes.
 
     Raises:
       CalibrationError: the readings do not rise with the force.
     """
-    own: dict[int, float] = {}  # by finger: N per count
-    newtons, error, notes = {}, {}, []
-    for press in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
-        levels = {level: press.samples(level) for level in press.gauge if len(press.samples(level))}
+    own, scales, notes = dict[int, float](), dict[str, Scale](), list[str]()  # `own` by finger: N per count
+    pressed = sorted(pressed, key=lambda press: not press.name.endswith("pad"))
+    for press in pressed:
+        levels = {level: press.at(level) for level in press.gauge if press.at(level).any()}
         if len(levels) < _READINGS:
             if levels:
                 notes.append(f"{press.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        counts = np.array([np.array(press.counts)[rows].mean(0) for rows in levels.values()])
-        counts = counts * active_taxels(counts, hand.taxel_grid)
+        counts = np.array([press.counts[rows].mean(0) for rows in levels.values()])
+        counts = counts * active_taxels(hand, counts)
         # The fit applies this gain to sums with the dead taxels filled in.
         counts = fill_dead(hand, counts, dead_taxels(hand, counts))
         gauge = np.array([press.gauge[level] for level in levels])
         if np.ptp(gauge) <= 0:
             raise CalibrationError(f"{press.name}, gauge: all readings are {gauge[0]:g} N")
         line = fit_line(gauge, np.maximum(counts.sum(-1), 0.0), np.arange(len(gauge)))
-        if line.gain_interval[0] <= 0:
+        if line.gain <= line.gain_error:
             raise CalibrationError(f"{press.name}, gauge: counts do not follow its readings ({line.gain:.3g} per N)")
-        newtons[press.name] = 1.0 / line.gain, -line.offset / line.gain
-        error[press.name] = float(np.hypot(line.gain_share, _GAUGE))
-        low, high = line.widened(float(np.hypot(_GAUGE, _PLACE))).gain_interval
-        notes.append(
-            f"{press.name}: {line.gain:.3g} [{low:.3g}, {high:.3g}] counts per newton by the gauge "
-            f"({line.samples} readings), {line.offset:.1f} counts at zero force"
-        )
+        error = float(np.hypot(line.gain_error / line.gain, _GAUGE))
+        scales[press.name] = Scale(1.0 / line.gain, -line.offset / line.gain, error)
+        found = f"{line.gain:.3g} +- {line.gain * np.hypot(error, _PLACE):.2g} counts per newton by the gauge"
+        notes.append(f"{press.name}: {found} ({len(gauge)} readings), {line.offset:.1f} counts at zero force")
         own.setdefault(press.finger, 1.0 / line.gain)
     others = float(np.mean(list(own.values()))) if own else source.hardware.force_per_count
     per_count = np.array([own.get(finger, others) for finger in range(hand.num_fingers)])
@@ -378,24 +290,22 @@ def force_scale(source: Source, hand: Hand, pressed: list[Recording]) -> ForceSc
                 f"{name}: not compared with the gauge; has the mean of the others (up to {100 * _OTHERS:.0f} % off)"
             )
     for press in pressed:
-        newtons.setdefault(press.name, (float(per_count[press.finger]), 0.0))
-        error.setdefault(press.name, _PLACE if press.finger in own else _OTHERS if own else _NOMINAL)
-    return ForceScale(per_count, newtons, error, bool(own), tuple(notes))
+        error = _PLACE if press.finger in own else _OTHERS if own else _NOMINAL
+        scales.setdefault(press.name, Scale(float(per_count[press.finger]), 0.0, error))
+    return per_count, scales, notes
 
 
-def active_taxels(counts: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+def active_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
     """Mask [N] of the taxels that take part in counts [T, N] of a press, and of those beside them."""
-    active = (counts.max(0) >= _ACTIVE).reshape(grid)
+    active = (counts.max(0) >= _ACTIVE).reshape(hand.taxel_grid)
     return binary_dilation(active, np.ones((3, 3))).ravel()
 
 
 def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [N] of taxels that read nothing in counts [T, N] of a press, although their neighbours did."""
-    largest = counts.max(0)
-    beside = np.where(around(hand, np.ones((1, hand.num_taxels))) > 0, around(hand, largest[None]), np.nan)[:, 0]
-    # At least half of the neighbours must read, so that taxels at the edge of a press do not count as dead.
-    pressed = (np.nanmean(beside, 0) >= _NEIGHBOURS) & (np.nanmedian(beside, 0) > 0.25 * _NEIGHBOURS)
-    return (largest <= 0) & pressed
+    """Mask [N] of taxels that read nothing in counts [T, N] of a press, although half of their neighbours did."""
+    largest, ring = counts.max(0).reshape(hand.taxel_grid), np.ones((3, 3), bool)
+    ring[1, 1] = False
+    return ((largest <= 0) & (median_filter(largest, footprint=ring) >= _ACTIVE)).ravel()
 
 
 def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:

@@ -5,17 +5,16 @@ a later one give the same result.
 """
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from dexsim_real.calibrate.bench import Bench
 from dexsim_real.calibrate.plan import Placement
-from dexsim_real.control.safety import Reaction
+from dexsim_real.control.safety import HandSample, Reaction
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
-from dexsim_real.loop import Exchange
 
 LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 """Phases of a press; "level K" is a force held for the gauge."""
@@ -23,7 +22,7 @@ TOUCHED = 20.0
 """Counts that a fingertip's sum may be off zero after a press."""
 
 _REST = 2.0  # s, recording with the motors off
-_ANSWERED = 0.5  # share of the exchanges at rest that must be answered
+_ANSWERED = 0.5  # share of the samples at rest that must be answered
 _TOUCH = 0.4  # N above which a fingertip touches
 _CLEARANCE = 0.2  # rad from the start of a press to the posture of contact
 _TRAVEL = 0.8  # rad, largest travel of a joint target past contact
@@ -63,10 +62,10 @@ class PressProcedure:
           HandError: too few answers, something touches a fingertip, or a taxel is stuck.
         """
         self.operator.tell("checking the taxels: do not touch the fingertips")
-        exchanges = self.bench.collect(_REST, mark={"press": "", "phase": REST})
-        if len(exchanges) < _ANSWERED * self.bench.arguments.rate * _REST:
-            raise HandError(f"only {len(exchanges)} answers in {_REST:g} s; check the cable, or close other programs")
-        self.bench.set_zero(exchanges)
+        samples = self.bench.collect(_REST, mark={"press": "", "phase": REST})
+        if len(samples) < _ANSWERED * self.bench.arguments.rate * _REST:
+            raise HandError(f"only {len(samples)} answers in {_REST:g} s; check the cable, or close other programs")
+        self.bench.set_zero(samples)
 
     def press(self, placement: Placement) -> bool:
         """All presses of one placement, again when they are missed; False when the user skips it.
@@ -74,17 +73,17 @@ class PressProcedure:
         Raises:
           HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
         """
-        record = {"placement": dataclasses.asdict(placement)}
-        for attempt in itertools.count(1):
+        record, attempts = {"placement": dataclasses.asdict(placement)}, 0
+        while True:
             self.bench.log.add(Kind.META, record)
             try:
                 return self._press(placement)
             except MissedPress as missed:
+                attempts += 1
                 self.bench.log.add(Kind.META, record)  # Drops what was recorded of it.
-                if self.operator.assume_yes and attempt >= _ATTEMPTS:
+                if self.operator.assume_yes and attempts >= _ATTEMPTS:
                     raise
                 self.operator.tell(f"  {missed}; again")
-        raise AssertionError("the attempts have no end")
 
     def _press(self, placement: Placement) -> bool:
         self._placement = placement
@@ -122,54 +121,46 @@ class PressProcedure:
         pause, target = self.config.pause, self._target()
         self.bench.collect(pause, target)
         self.bench.set_zero(self.bench.collect(pause, target))
-        free = [self._force(exchange) for exchange in self.bench.collect(pause, target)]
+        free = [self._force(sample) for sample in self.bench.collect(pause, target)]
         self._touch = max(_TOUCH, float(np.mean(free) + 6 * np.std(free)))
 
     def _approach(self) -> None:
         """Advance until contact, where the advance is set to zero."""
         name = self._placement.name
-        while True:
-            exchange = self._step(self.config.approach_speed)
-            if exchange is None:
+        for sample in self._advancing(self.config.approach_speed):
+            if sample is None:
                 continue
-            if self._force(exchange) >= self._touch:
-                break
-            if self._overloaded(exchange):
+            if self._force(sample) >= self._touch:
+                self._base, self._advance = self._target(), 0.0
+                return
+            if self._overloaded(sample):
                 raise MissedPress(
-                    f"{name}: {exchange.sample.measured.current.max():.2f} A and no taxel feels it; press on the "
+                    f"{name}: {sample.measured.current.max():.2f} A and no taxel feels it; press on the "
                     "taxels, and check that their sensor is connected"
                 )
-            if self._advance >= _TRAVEL:
-                raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
-        self._base, self._advance = self._target(), 0.0
+        raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
 
     def _load(self, speed: float) -> None:
         """Press until peak force, current or travel is reached, or the motors stall."""
         assert self.bench.safety.sample is not None, "the approach has read the pose"
         begin, first = self.bench.safety.sample.measured.joint_position.astype(float), self._target()
         second = round(self.bench.arguments.rate)
-        forces: list[float] = []
-        positions: list[np.ndarray] = []
-        while True:
-            exchange = self._step(speed, LOADING)
-            if exchange is None:
+        forces, positions = list[float](), list[np.ndarray]()
+        for sample in self._advancing(speed, LOADING):
+            if sample is None:
                 forces.clear()  # After an interruption a constant force does not mean that the motors stall.
                 continue
-            forces.append(self._force(exchange))
-            positions.append(exchange.sample.measured.joint_position.astype(float))
-            if forces[-1] >= self.config.peak or self._overloaded(exchange):
+            forces.append(self._force(sample))
+            positions.append(sample.measured.joint_position.astype(float))
+            before = np.mean(forces[-second - _LAST : -second]) if len(forces) > 2 * second else -np.inf
+            ended = forces[-1] >= self.config.peak or self._overloaded(sample)
+            if ended or np.mean(forces[-_LAST:]) - before < _STALL * self.config.peak:
                 break
-            stalled = (
-                len(forces) > 2 * second
-                and np.mean(forces[-_LAST:]) - np.mean(forces[-second - _LAST : -second]) < _STALL * self.config.peak
+        if not ended and forces[-1] < 4 * self._touch:
+            raise MissedPress(
+                f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something firmer, or raise "
+                "--hardware.torque-max"
             )
-            if self._advance >= _TRAVEL or stalled:
-                if forces[-1] < 4 * self._touch:
-                    raise MissedPress(
-                        f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something "
-                        "firmer, or raise --hardware.torque-max"
-                    )
-                break
         self._held = (self._target() - first, np.mean(positions[-_LAST:], 0) - begin)
 
     def _aim(self, lean: float) -> None:
@@ -192,7 +183,7 @@ class PressProcedure:
             phase = f"level {number}"
             mark = {"press": self._placement.name, "phase": phase}
             held = self.bench.collect(pause, self._target(), mark)
-            mean = np.mean([self._force(exchange) for exchange in held])
+            mean = np.mean([self._force(sample) for sample in held])
             self.operator.tell(f"  holding; the taxels read {mean:.1f} N")
             force = self.operator.ask_force(lambda: self._step(0.0, phase))  # noqa: B023
             if force is not None:
@@ -200,47 +191,51 @@ class PressProcedure:
 
     def _seek(self, force: float, speed: float, phase: str = "") -> None:
         """Advance or retract until the force is passed, or a limit is reached."""
+        for sample in self._advancing(speed, phase):
+            if sample is None:
+                continue
+            over = (self._force(sample) - force) * math.copysign(1.0, speed)
+            if over >= 0 or (speed > 0 and self._overloaded(sample)):
+                return
+
+    def _advancing(self, speed: float, phase: str = "") -> Iterator[HandSample | None]:
+        """Steps until the end of the travel."""
         end = _TRAVEL if speed > 0 else -_CLEARANCE
         while (end - self._advance) * speed > 0:
-            exchange = self._step(speed, phase)
-            if exchange is None:
-                continue
-            over = (self._force(exchange) - force) * math.copysign(1.0, speed)
-            if over >= 0 or (speed > 0 and self._overloaded(exchange)):
-                return
+            yield self._step(speed, phase)
 
     def _back_off(self) -> None:
         """Free the fingertip, and check that it does not read far below zero: it was touched when it was tared."""
         self._start()
         self.bench.collect(self.config.pause, self._target())
         name, finger, sensing = self._placement.name, self._placement.finger, self.bench.sensing
-        exchanges = self.bench.collect(self.config.pause, self._target(), {"press": name, "phase": RELEASED})
-        sums = [(sensing.counts(exchange.state) - sensing.tare)[finger].sum() for exchange in exchanges]
+        samples = self.bench.collect(self.config.pause, self._target(), {"press": name, "phase": RELEASED})
+        sums = [(sensing.counts(sample.state) - sensing.tare)[finger].sum() for sample in samples]
         if np.median(sums) < -TOUCHED:
             raise MissedPress(
                 f"{name}: reads {np.median(sums):.0f} counts after the press: it was touched while it was tared; free "
                 "the fingertip"
             )
 
-    def _step(self, speed: float, phase: str = "") -> Exchange | None:
+    def _step(self, speed: float, phase: str = "") -> HandSample | None:
         """One exchange, advanced at this speed in rad/s, logged as a sample of the phase unless that is empty.
 
         None when the hand did not answer or `Safety` held it; the advance then stays as it was.
         """
         before, self._advance = self._advance, min(self._advance + speed * self.bench.pace.period, _TRAVEL)
-        exchange = self.bench.step(self._target())
-        if exchange is None or exchange.decision.reaction > Reaction.CLIP:
+        sample = self.bench.step(self._target())
+        if sample is None or self.bench.safety.last[0] > Reaction.CLIP:
             self._advance = before
             return None
         if phase:
             self.bench.annotate({"press": self._placement.name, "phase": phase})
-        return exchange
+        return sample
 
     def _target(self) -> np.ndarray:
         return self._base + self._advance * self._direction
 
-    def _force(self, exchange: Exchange) -> float:
-        return float(exchange.sample.measured.finger_force[self._placement.finger])
+    def _force(self, sample: HandSample) -> float:
+        return float(sample.measured.finger_force[self._placement.finger])
 
-    def _overloaded(self, exchange: Exchange) -> bool:
-        return float(exchange.sample.measured.current.max()) >= self.config.current
+    def _overloaded(self, sample: HandSample) -> bool:
+        return float(sample.measured.current.max()) >= self.config.current

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,23 +54,23 @@ def read_logs(paths: Iterable[Path], task: str) -> tuple[Source, list[list[Recor
 
 @dataclasses.dataclass
 class Recording:
-    """One press; the lists have T samples in the order of time."""
+    """One press; T samples in the order of time."""
 
     name: str
     finger: int
     joints: tuple[int, ...]  # joints that pressed
     rate: float  # samples per second
-    phase: list[str] = dataclasses.field(default_factory=list)
-    time: list[float] = dataclasses.field(default_factory=list)  # s
-    counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] tared, negative ones included
-    shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of x and y beyond the rest's
-    current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the sign of the hand
-    position: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] rad
-    gauge: dict[str, float] = dataclasses.field(default_factory=dict)  # N by phase
+    gauge: dict[str, float]  # N by phase
+    phase: np.ndarray  # [T] str
+    time: np.ndarray  # [T] s
+    counts: np.ndarray  # [T, N] tared, negative ones included
+    shear: np.ndarray  # [T, 2] counts, sums of x and y beyond the rest's
+    current: np.ndarray  # [T, J] A, with the sign of the hand
+    position: np.ndarray  # [T, J] rad
 
-    def samples(self, *phases: str) -> np.ndarray:
-        """Indices of the samples of these phases."""
-        return np.flatnonzero(np.isin(self.phase, phases))
+    def at(self, *phases: str) -> np.ndarray:
+        """Mask [T] of the samples of these phases."""
+        return np.isin(self.phase, phases)
 
     @property
     def finished(self) -> bool:
@@ -87,43 +87,41 @@ def read_presses(paths: Iterable[Path], hand: Hand) -> tuple[Source, dict[str, R
     source, logs = read_logs(paths, "calibrate")
     recordings: dict[str, Recording] = {}
     for records in logs:
-        for name, press in _presses(source, records, hand).items():
-            before = recordings.get(name)
-            # A press that was skipped or missed is in its log without samples.
-            if before is None or press.time and (press.finished or not before.time):
-                recordings[name] = press
+        for press in _presses(source, records, hand):
+            if press.finished or press.name not in recordings:
+                recordings[press.name] = press
     return source, recordings
 
 
-def _presses(source: Source, records: list[Record], hand: Hand) -> dict[str, Recording]:
-    sensing, recordings, slant = HandSensing(hand, source.hardware), dict[str, Recording](), list[np.ndarray]()
+def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recording]:
+    """The presses of one log; those that were skipped or missed have no samples and are none."""
+    sensing, slant = HandSensing(hand, source.hardware), list[np.ndarray]()
+    presses = dict[str, tuple[dict[str, Any], dict[str, float], list[tuple[Any, ...]]]]()
     for record in records:
         content = record.content
         if "tare" in content:
             sensing.tare = np.array(content["tare"], np.float32)
         if "placement" in content:
-            name, finger, joints = (content["placement"][key] for key in ("name", "finger", "joints"))
-            recordings[name] = Recording(name, finger, tuple(joints), source.rate)
+            presses[content["placement"]["name"]] = content["placement"], {}, []
         if record.kind == Kind.META:
             continue
-        press = recordings.get(content["press"])
-        if press is not None and "gauge" in content:
-            press.gauge[content["phase"]] = float(content["gauge"])
+        placement, gauge, samples = presses.get(content["press"], ({"finger": 0}, {}, []))
+        if "gauge" in content:
+            gauge[content["phase"]] = float(content["gauge"])
             continue
-        state = sensing.decode(content["answer"])
+        state, finger = sensing.decode(content["answer"]), placement["finger"]
         shear = np.stack([state["tip"]["taxel"][axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
         if content["phase"] == REST:
             slant.append(shear)
-        if press is not None:
-            measured, finger = sensing.measure(state), press.finger
-            press.phase.append(content["phase"])
-            press.time.append(record.time)
-            press.counts.append(sensing.counts(state)[finger].astype(float) - sensing.tare[finger].astype(float))
-            press.shear.append(shear[finger])
-            press.current.append(state["joint"]["current"].astype(float) * 1e-3)
-            press.position.append(measured.joint_position.astype(float))
-    if slant:  # A taxel may read some x and y that no shear has caused.
-        zero = np.mean(slant, 0)
-        for press in recordings.values():
-            press.shear = [shear - zero[press.finger] for shear in press.shear]
+        counts = sensing.counts(state)[finger].astype(float) - sensing.tare[finger]
+        current, position = 1e-3 * state["joint"]["current"], sensing.measure(state).joint_position.astype(float)
+        samples.append((content["phase"], record.time, counts, shear[finger], current, position))
+    zero = np.mean(slant, 0) if slant else np.zeros((hand.num_fingers, 2))  # A taxel may read x and y without shear.
+    recordings = []
+    for name, (placement, gauge, samples) in presses.items():
+        if samples:
+            phase, time, counts, shear, *rest = (np.array(column) for column in zip(*samples, strict=True))
+            finger, joints = placement["finger"], tuple(placement["joints"])
+            parts = (phase, time, counts, shear - zero[finger], *rest)
+            recordings.append(Recording(name, finger, joints, source.rate, gauge, *parts))
     return recordings

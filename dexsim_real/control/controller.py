@@ -14,13 +14,24 @@ import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.hand.description import Hand
-from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
+from dexsim.observation import FIELDS, LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
 from dexsim.task_spec import correct_readings
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.sensors.imu import IDENTITY
-from dexsim_real.sensors.readings import ObjectEstimate, check_measured, make_readings, sources_of
+from dexsim_real.sensors.object_sensors import ObjectEstimate
+
+SOURCES = ("hand", "camera", "imu", "user", "policy")
+"""Who gives the bridge what a policy observes; see `ObservationField.source`."""
+
+NEEDS = {
+    "joint_torque": ("currents",),
+    "contact_force": ("taxels",),
+    "contact_centre": ("taxels",),
+    "finger_force": ("taxels", "currents"),
+}
+"""What a hand must measure, besides its angles, for an observation field."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +59,16 @@ def prepare_jax() -> None:
 def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> Any:
     """The jit-compiled `observe` of a task, from `Readings` to the observation."""
     return jax.jit(lambda readings: observe(hand, readings, names, config))
+
+
+def sources_of(names: Sequence[str]) -> set[str]:
+    """The sensors ("hand", "camera", "imu", ...) for these observation fields. HandError: none measures one of them."""
+    for name in names:
+        if name not in FIELDS or FIELDS[name].source not in SOURCES:
+            raise HandError(
+                f"the policy observes {name!r:.80}, which no sensor measures on hardware; use a policy without it"
+            )
+    return {FIELDS[name].source for name in names}
 
 
 class Controller:
@@ -91,8 +112,17 @@ class Controller:
         self.start(joints)
 
     def check_measured(self, missing: Sequence[str]) -> None:
-        """Raises HandError: the policy needs what the hand does not measure (`wire.driver.WITHOUT`)."""
-        check_measured(select_fields(self.spec.fields, self.spec.observation), self.spec.force_loop, missing)
+        """Raises HandError: the policy needs what the hand does not measure, names in `wire.driver.WITHOUT`."""
+        names = select_fields(self.spec.fields, self.spec.observation)
+        wanted = {f"observes {name!r}": NEEDS.get(name, ()) for name in names}
+        if self.spec.force_loop:
+            wanted["corrects its command by the measured force"] = NEEDS["finger_force"]
+        for what, needs in wanted.items():
+            if lacking := [need for need in needs if need in missing]:
+                raise HandError(
+                    f"the policy {what}, and the hand has no {' and no '.join(lacking)}; train one without it "
+                    "(--env.observation.leave-out, --env.control.force.gain 0)"
+                )
 
     def start(self, target: np.ndarray) -> None:
         """Begin an episode with these joint targets [J] rad and no previous action."""
@@ -114,7 +144,21 @@ class Controller:
     def tick(self, measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Readings, observation, action and joint targets; `goal_quat` [4] of the object, grip command in [0, 1]."""
         self.actions = np.stack([self._recall(self.last_action, self.target), *self.actions[:2]])
-        readings = make_readings(measured, estimate, goal_quat, command, self.actions)
+        values = {
+            "joint_position": measured.joint_position,
+            "joint_torque": measured.joint_torque,
+            "taxel_force": measured.taxel_force,
+            "object_position": estimate.position,
+            "object_velocity": estimate.velocity,
+            "object_quat": estimate.quat,
+            "goal_quat": goal_quat,
+            "command": command,
+            "last_action": self.actions[0],
+            "past_actions": self.actions[1:],
+            "palm_gravity": estimate.palm_gravity,
+        }
+        arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in values.items()}
+        readings = Readings(**arrays)
         if self.spec.force_loop:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)

@@ -15,8 +15,7 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.imu import IDENTITY, conjugate, multiply
-from dexsim_real.sensors.object_sensors import ObjectSensors
-from dexsim_real.sensors.readings import ObjectEstimate
+from dexsim_real.sensors.object_sensors import ObjectEstimate, ObjectSensors
 
 _PATIENCE = 60.0  # s to wait until the camera sees the object
 _SMOOTH = 0.1  # s, of the object's angular velocity
@@ -92,7 +91,7 @@ class PolicyLoop:
         self.controller, self.safety, self.objects, self.command = controller, safety, objects, command
         spec = controller.spec
         self.goals: TurnGoals | None = None
-        if spec.turn and objects.measures_orientation:
+        if spec.turn and objects.imu:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
         self.ticks, self.finger_force = 0, np.zeros(controller.hand.num_fingers)  # number; N, sum over the ticks
         self._approach, self._place, self._motors_off = approach, place, motors_off

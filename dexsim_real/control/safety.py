@@ -55,6 +55,7 @@ class HandSample:
     generation: int  # number of the connection
     measured: HandMeasurement
     velocity: np.ndarray  # [J] rad/s
+    state: np.ndarray  # that it was measured from: `frames.STATE_BLOCK` or `frames.driver_block`
 
 
 @dataclasses.dataclass(frozen=True)

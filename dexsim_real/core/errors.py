@@ -1,4 +1,4 @@
-"""Errors of the bridge: one line that names the problem and the remedy."""
+"""Errors of the bridge: one line that names the problem and the remedy, also of a port or a function of the user."""
 
 import errno
 import grp
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.core.errors import DexsimError
+from dexsim.core.install import install_line
 
-PORT_ERRORS = (OSError, ValueError, NotImplementedError, termios.error)
+_PORT_ERRORS = (OSError, ValueError, NotImplementedError, termios.error)
 """What opening a serial port raises: `termios.error` when it vanishes meanwhile, `NotImplementedError` for a URL whose
 kind of port lacks a setting, such as rfc2217://."""
 
@@ -20,6 +21,24 @@ class HandError(DexsimError):
     """The hand or one of its sensors cannot be reached, or cannot do what was asked."""
 
     page = "docs/troubleshooting.md#bridge"
+
+
+def open_serial(port: str, baud: int, **options: Any) -> Any:
+    """The serial port at a device, by-id link, pseudo-terminal or pyserial URL, for nobody else meanwhile.
+
+    Raises:
+      HandError: it cannot be opened, or pyserial is missing.
+    """
+    try:
+        import serial
+    except ImportError:
+        raise HandError(f"pyserial is missing: {install_line('real')}") from None
+    if "://" not in port:
+        options["exclusive"] = True
+    try:
+        return serial.serial_for_url(port, baudrate=baud, **options)
+    except _PORT_ERRORS as error:
+        raise HandError(explain(port, error)) from None
 
 
 def explain(port: str, error: Exception) -> str:

@@ -83,6 +83,13 @@ class LogWriter:
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
 
+    @property
+    def losses(self) -> str:
+        """One line about lost records; empty if there are none."""
+        if not (self.dropped or self.failure):
+            return ""
+        return f"{self.dropped} log records are lost ({self.failure or 'the disk is too slow'})"
+
     def __enter__(self) -> "LogWriter":
         return self
 

@@ -25,11 +25,10 @@ from pathlib import Path
 
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
-from dexsim_real.control.motors_off import UNCONFIRMED, turn_off
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import passive_command
-from dexsim_real.wire.link import LinkConfig
+from dexsim_real.wire.link import UNCONFIRMED, LinkConfig
 from dexsim_real.wire.serial_hand import open_port
 
 _OFF = b"off"
@@ -188,7 +187,7 @@ def _stop(port: str, link: LinkConfig, hand: Hand) -> bool:
         # Whatever somebody's own port does here, the next attempt may succeed.
         with contextlib.suppress(Exception, SystemExit), contextlib.closing(open_port(port, hand, link)) as line:
             line.connect()
-            done = turn_off(line, passive_command(hand.num_joints), _ATTEMPT)
+            done = line.turn_off(passive_command(hand.num_joints), _ATTEMPT)
         if done:  # Also where the port could not be closed.
             return True
         time.sleep(pause)

@@ -1,34 +1,17 @@
-"""Options of `python -m dexsim_real.run`, and of every user of the exchange loop."""
+"""Options of `python -m dexsim_real.run`."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from dexsim.core.config import Config, setting
-from dexsim_real.control.limits import SafetyConfig
+from dexsim.core.config import setting
 from dexsim_real.core.errors import HandError
+from dexsim_real.loop import LoopOptions
 from dexsim_real.sensors.camera import CameraConfig
-from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.sensors.imu import UPRIGHT_X, check_mount
-from dexsim_real.wire.link import LinkConfig
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LoopOptions(Config):
-    """Options of the exchange loop."""
-
-    guard: bool = True
-    """Start a second process that turns the motors off when this one dies or freezes."""
-    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand per second; a run adjusts it by up to 1 %, to compute during the wait for an answer."""
-    link: LinkConfig = setting(LinkConfig())
-    """The serial line."""
-    hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains of the hand."""
-    safety: SafetyConfig = setting(SafetyConfig())
-    """Safety limits."""
+from dexsim_real.sensors.imu import UPRIGHT_X
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +46,8 @@ class RunArguments(LoopOptions):
     no camera."""
     fixed_object: bool = False
     """Run without a camera: assume that the object stays at its nominal position."""
+    guard: bool = True
+    """Start a second process that turns the motors off when this one dies or freezes."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
     """Time to move from the measured pose to the task's start posture; 0 stays at the measured pose."""
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
@@ -80,6 +65,7 @@ class RunArguments(LoopOptions):
 
     def __post_init__(self):
         super().__post_init__()
-        check_mount(self.imu_mount, "--imu-mount")
+        if math.hypot(*self.imu_mount) < 1e-3:
+            raise HandError(f"--imu-mount {' '.join(f'{v:g}' for v in self.imu_mount)}: is no orientation (w, x, y, z)")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")

@@ -23,9 +23,8 @@ from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, Tick, prepare_jax
-from dexsim_real.control.motors_off import UNCONFIRMED
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
-from dexsim_real.control.safety import HandSample, Reaction, Safety
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
@@ -38,6 +37,7 @@ from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.wire.link import UNCONFIRMED
 from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
@@ -127,15 +127,14 @@ class Outcome:
     """Whether a run did what it was started for: a hand that was gone or held, or lost records, are no success."""
 
     def __init__(self, began: float = 0.0):
-        self._last = began
-        self._total = self._blind = self._held = 0.0  # s
+        self._began = self._last = began
+        self._blind = self._held = 0.0  # s
         self._actions = self._wrong = 0
         self._reason = self._silence = ""  # of the newest hold, and of the newest refusal
 
     def add(self, now: float, target: np.ndarray | None, safety: Safety) -> None:
         """Count the time up to `now` s; `target` [J] is the policy's, None when no measurement was young enough."""
         step, self._last = now - self._last, now
-        self._total += step
         if target is None:
             self._blind += step
             self._silence = safety.refused or self._silence
@@ -149,18 +148,15 @@ class Outcome:
 
     def missing(self, log: LogWriter) -> list[str]:
         """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
-        lines = []
-        if self._blind > _BLIND * self._total:
-            why = f" ({self._silence})" if self._silence else ""
-            lines.append(f"no measurement for {100 * self._blind / self._total:.0f} % of the run{why}")
-        if self._wrong:
-            lines.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
-        if self._held > _HELD * self._total:
-            share = 100 * self._held / self._total
-            lines.append(f"the hand was held for {share:.0f} % of the run, last because: {self._reason}")
-        if log.dropped or log.failure:
-            lines.append(f"{log.dropped} log records are lost ({log.failure or 'the disk is too slow'})")
-        return lines
+        total = max(self._last - self._began, 1e-9)
+        blind, held, why = self._blind / total, self._held / total, f" ({self._silence})" if self._silence else ""
+        lines = {
+            f"no measurement for {100 * blind:.0f} % of the run{why}": blind > _BLIND,
+            f"{self._wrong} of {self._actions} actions of the policy were not finite": self._wrong,
+            f"the hand was held for {100 * held:.0f} % of the run, last because: {self._reason}": held > _HELD,
+            log.losses: log.losses,
+        }
+        return [line for line, true in lines.items() if true]
 
 
 class Session:
@@ -279,7 +275,7 @@ class Session:
         """Results and statistics of the run so far; JSON-able."""
         loop, safety, policy = self.loop, self.safety, self.policy
         reaction, reason = safety.last
-        summary = {
+        summary: dict[str, Any] = {
             "end": self.end,
             "motors_off": not loop.driven,
             "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
@@ -347,19 +343,15 @@ class Session:
             self.outcome.add(now, tick.target if tick else None, self.safety)
             if tick is not None:
                 self.newest = tick
-                self._log_tick(now, tick, policy.sample)
+                fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
+                fields |= {"sequence": policy.sample.sequence, "age": now - policy.sample.time}
+                self.log.add(Kind.TICK, fields | {"readings": vars(tick.readings)}, now)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
         self._check()
 
-    def _log_tick(self, now: float, tick: Tick, sample: HandSample) -> None:
-        fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
-        fields |= {"sequence": sample.sequence, "age": now - sample.time, "readings": vars(tick.readings)}
-        self.log.add(Kind.TICK, fields, now)
-
     def _tap(self, direction: str, data: bytes) -> None:
-        kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
-        self.log.add(kind, (self.port.counts.sent, data))
+        self.log.add(Kind.SENT if direction == "tx" else Kind.RECEIVED, (self.port.counts.sent, data))
 
     def _retare(self, sequence: int, lines: list[str]) -> None:
         """Zeros have moved, or taxels got stuck: a replay needs to know from which exchange on."""
@@ -426,15 +418,16 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
     if "camera" in needed and not (arguments.camera or arguments.fixed_object):
         raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
-    reference, optics, camera, imu = np.asarray(spec.reference, float), arguments.optics, None, None
+    reference = np.asarray(spec.reference, float)
+    objects = ObjectSensors(reference)
     try:
         if arguments.camera:
-            masks = open_masks(arguments.camera, optics)
-            camera = HeightSensor(masks, optics, reference, spec.object_axes, spec.velocity_filter)
+            masks = open_masks(arguments.camera, arguments.optics)
+            objects.camera = HeightSensor(masks, arguments.optics, reference, spec.object_axes, spec.velocity_filter)
         if arguments.imu:
-            imu = Imu(arguments.imu, arguments.imu_mount)
+            objects.imu = imu = Imu(arguments.imu, arguments.imu_mount)
             imu.wait()
-        return ObjectSensors(reference, camera, imu)
     except BaseException:
-        ObjectSensors(reference, camera, imu).close()
+        objects.close()
         raise
+    return objects

@@ -2,7 +2,7 @@
 
 The IMU sends 100 RVC frames a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01 degree, three
 accelerations in mg, three more bytes, and the sum of all bytes after the head (BNO080 datasheet, 1.3.5.2). Yaw has no
-absolute reference and the palm may lean, so a known pose of the object aligns both (`align`). Yaw, pitch and roll are
+absolute reference and the palm may lean, so a known pose of the object aligns both. Yaw, pitch and roll are
 singular where the IMU's x points up or down: mount it with its z along the axis that stays upright. `UPRIGHT_X` is the
 mount in an object that turns about its x.
 """
@@ -14,8 +14,7 @@ import time
 
 import numpy as np
 
-from dexsim.core.install import install_line
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
+from dexsim_real.core.errors import HandError, open_serial
 
 HEAD = b"\xaa\xaa"
 SIZE = 19
@@ -29,12 +28,6 @@ _SAMPLES = 5  # in a row that are far from the last make a jump: a damaged frame
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
-
-
-def check_mount(mount: tuple[float, ...], where: str) -> None:
-    """Raises HandError: an orientation [4] of (nearly) no length; `where` names the option."""
-    if np.linalg.norm(mount) < 1e-3:
-        raise HandError(f"{where} {' '.join(f'{v:g}' for v in mount)}: is no orientation (w, x, y, z)")
 
 
 def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
@@ -102,18 +95,12 @@ def conjugate(a: np.ndarray) -> np.ndarray:
     return a * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The rotation [4] from the IMU's world frame to the palm frame.
-
-    `sensed` [4] is the orientation of the IMU in its world frame, `known` [4] that in the palm frame at the same time.
-    All three angles come from this pose. Gravity would give two of them only if the palm's own lean were known: a mount
-    that leans would then look like a turned object. What the pose is off by stays as a constant error.
-    """
-    return multiply(known, conjugate(sensed))
-
-
 class ImuReader:
     """From an IMU's bytes to the orientation of the object in the palm frame.
+
+    All three angles between the IMU's world and the palm come from one known pose (`calibrate`). Gravity would give two
+    of them only if the palm's own lean were known: a mount that leans would then look like a turned object. What the
+    pose is off by stays as a constant error.
 
     A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
     the last sound one than an object turns between two samples is left out; when the next ones are, too, `jumped` is
@@ -151,7 +138,7 @@ class ImuReader:
     def calibrate(self, known: np.ndarray) -> None:
         """Align: the object now has the orientation `known` [4] in the palm frame."""
         assert self._newest is not None, "`wait` for the first orientation"
-        self._world = align(self._newest[1], multiply(known, self._mount))
+        self._world = multiply(multiply(known, self._mount), conjugate(self._newest[1]))
 
     def read(self) -> tuple[float, np.ndarray]:
         """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
@@ -180,14 +167,7 @@ class Imu(ImuReader):
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
         super().__init__(mount, port)
         self._stop = threading.Event()
-        try:
-            import serial
-        except ImportError:
-            raise HandError(f"pyserial is missing: {install_line('real')}") from None
-        try:
-            self._serial = serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
-        except PORT_ERRORS as error:
-            raise HandError(explain(port, error)) from None
+        self._serial = open_serial(port, BAUD, timeout=0.05)
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
 

@@ -28,7 +28,6 @@ from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
-from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import SERIALS, Firmware
 from dexsim_real.twin.wire.line import HandLine, Terminal
 from dexsim_real.wire.serial_hand import check_wire
@@ -45,7 +44,7 @@ class TwinArguments(Config):
     hand: str = ""
     """The TOML of a hand of your own, with the joints and taxels that the wire format has; empty for the XHand."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
-    """Seed of all random numbers: parameters, objects, noise, faults."""
+    """Seed of all random numbers: parameters, objects, noise."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
     """Number of trials, with one object each."""
     first: int = setting(0, unit="1", low=0, high=100_000)
@@ -64,11 +63,6 @@ class TwinArguments(Config):
     """Third-party MJCF of the hand, which takes the place of the emulated hand's body and contacts
     (docs/emulated_hand.md). Its motors are left out: the emulated hand's drive its joints. None for the emulated hand's
     own."""
-    faults: tuple[str, ...] = ()
-    """Injected faults, each "12.5 stall 0.2" (seconds after the first exchange, kind, values) or "1% flip" (share of
-    the exchanges): flip (wrong bits in an answer); late, stall and disconnect SECONDS; heat JOINT KELVIN SECONDS; error
-    JOINT BITS SECONDS; off JOINT SECONDS; refuse NUMBER SECONDS; angle JOINT RADIANS SECONDS; stuck TIP TAXEL COUNT
-    SECONDS."""
 
 
 class PlantClock:
@@ -120,9 +114,8 @@ class Twin:
         self.arguments, self.plant, self._show = arguments, plant, show
         self.start, seed = time.monotonic(), arguments.seed
         self.clock = PlantClock(plant, self.start, self.note)
-        self.injector = Injector(arguments.faults, seed)
         terminal, firmware = Terminal(folder / "hand"), Firmware(plant, self.note)
-        self.line = HandLine(terminal, firmware, self.injector, seed=seed, catch_up=self.clock.catch_up, note=self.note)
+        self.line = HandLine(terminal, firmware, seed=seed, catch_up=self.clock.catch_up)
         try:
             if arguments.task == "grasp":
                 self.sensor: EmulatedImu | EmulatedCamera = EmulatedCamera(folder / "masks", plant, seed, self.start)
@@ -131,8 +124,7 @@ class Twin:
         except BaseException:
             terminal.close()
             raise
-        self._first = self._trial = plant.trial
-        self._stop = False
+        self._first, self._done, self._stop = plant.trial, 0, False  # of the trials
 
     def stop(self) -> None:
         """End soon; may be called from a signal handler."""
@@ -152,8 +144,7 @@ class Twin:
                 self.sensor.serve(now)
             self._count_trials()
             pause = (min(due, self.line.due()) if free else self.line.due()) - time.monotonic()
-            ports = [self.line.terminal] if self.line.terminal.connected else []
-            select.select(ports, [], [], max(pause, 0.0))
+            select.select([self.line.terminal], [], [], max(pause, 0.0))
 
     def close(self) -> None:
         """Close all ports."""
@@ -169,7 +160,6 @@ class Twin:
         return {
             "trials": self.plant.results()[: self.arguments.trials],
             "line": dict(self.line.counts),
-            "injected_faults": dict(self.injector.injected),
             "slipped_s": round(self.clock.slipped, 3),
         }
 
@@ -180,12 +170,12 @@ class Twin:
         return words + (["--hand", self.arguments.hand] if self.arguments.hand else [])
 
     def _count_trials(self) -> None:
-        if self.plant.trial == self._trial:
+        done, trials = self.plant.trial - self._first, self.arguments.trials
+        if done == self._done:
             return
-        self._trial = self.plant.trial
-        done = self._trial - self._first
-        self.note(f"end of trial {done} of {self.arguments.trials}: {self.plant.results()[done - 1].get('end', '')}")
-        if done >= self.arguments.trials:
+        self._done = done
+        self.note(f"end of trial {done} of {trials}: {self.plant.results()[done - 1].get('end', '')}")
+        if done >= trials:
             self._stop = True
             self.note("all trials are over: the hand's port closes")
 

@@ -47,7 +47,7 @@ def ideal_calibration(hand: Hand) -> Calibration:
     def side(gain: np.ndarray) -> Side:
         both, one = np.broadcast_to(gain, (2, hand.num_joints)).astype(float), np.ones(hand.num_joints)
         zero = np.zeros_like(both)
-        return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero, 0 * one, one, one)
+        return Side(both, zero, zero, zero, zero + 1, 0 * one, one, one)
 
     return Calibration(
         real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
@@ -65,7 +65,7 @@ class VirtualPort(HandPort):
 
     def __init__(self, plant: EmulatedHand):
         self.plant, self.firmware = plant, Firmware(plant)
-        self.time, self.counts, self._sequence = 0.0, LinkCounts(), 0
+        self.time, self.counts = 0.0, LinkCounts()
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
 
@@ -81,13 +81,12 @@ class VirtualPort(HandPort):
         sent = self.time
         self.wait_until(sent + REQUEST)
         request = Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes())
-        answer = self.firmware.answer(request, self.time)
+        answer = self.firmware.answer(request)
         assert answer is not None, "the request is addressed to this hand"
         self.wait_until(sent + ROUND_TRIP)
-        self._sequence += 1
         self.counts.sent += 1
         self.counts.answered += 1
-        return Reply(decode_state(answer.data), sent, self.time, self._sequence, generation=1)
+        return Reply(decode_state(answer.data), sent, self.time, self.counts.sent, generation=1)
 
     def clock(self) -> float:
         """Virtual time in s."""
@@ -178,16 +177,10 @@ class VirtualRun:
         self.port = port = VirtualPort(plant)
         sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
-        imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
-        camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
-        self.policy = PolicyLoop(
-            controller,
-            self.safety,
-            ObjectSensors(np.asarray(controller.spec.reference, float), camera, imu),
-            command=command,
-            approach=_APPROACH,
-            place=_PLACE,
-        )
+        objects = ObjectSensors(np.asarray(controller.spec.reference, float))
+        objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
+        objects.camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
+        self.policy = PolicyLoop(controller, self.safety, objects, command=command, approach=_APPROACH, place=_PLACE)
         self.trace: list[dict[str, Any]] | None = None
 
     def run(self) -> dict[str, Any]:

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dexsim.core.install import install_line
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
+from dexsim_real.core.errors import HandError, open_serial
 from dexsim_real.wire.driver import DriverState, JointTargets
 
 HEADER = b"\xff\xff\xfd\x00"
@@ -42,25 +41,26 @@ _LONGEST = 64  # bytes after the length of an answer; more in a header is damage
 _HEALTH_EVERY = 8  # reads between two looks at torque and errors of motors that report no alert
 
 
-class Register(NamedTuple):
-    """A range of the control table."""
+class Register:
+    """A range of the control table: its address, and the type of its fields."""
 
-    address: int
-    dtype: np.dtype
+    def __init__(self, address: int, *fields: tuple[str, str]):
+        self.address, self.dtype = address, np.dtype(list(fields))
+
+    @property
+    def span(self) -> bytes:
+        """Address and size, as requests have them."""
+        return self.address.to_bytes(2, "little") + self.dtype.itemsize.to_bytes(2, "little")
 
 
-def _register(address: int, *fields: tuple[str, str]) -> Register:
-    return Register(address, np.dtype(list(fields)))
-
-
-SETTINGS = _register(9, ("return_delay", "u1"), ("drive_mode", "u1"), ("operating_mode", "u1"))
-CURRENT_LIMIT = _register(38, ("value", "<u2"))  # mA
-HEALTH = _register(64, ("torque", "u1"), ("between", "V5"), ("error", "u1"))
-TORQUE = _register(64, ("value", "u1"))
-GAINS = _register(80, ("kd", "<u2"), ("ki", "<u2"), ("kp", "<u2"))
-GOAL_CURRENT = _register(102, ("value", "<i2"))  # mA
-GOAL_POSITION = _register(116, ("value", "<i4"))  # ticks
-PRESENT = _register(
+SETTINGS = Register(9, ("return_delay", "u1"), ("drive_mode", "u1"), ("operating_mode", "u1"))
+CURRENT_LIMIT = Register(38, ("value", "<u2"))  # mA
+HEALTH = Register(64, ("torque", "u1"), ("between", "V5"), ("error", "u1"))
+TORQUE = Register(64, ("value", "u1"))
+GAINS = Register(80, ("kd", "<u2"), ("ki", "<u2"), ("kp", "<u2"))
+GOAL_CURRENT = Register(102, ("value", "<i2"))  # mA
+GOAL_POSITION = Register(116, ("value", "<i4"))  # ticks
+PRESENT = Register(
     126, ("current", "<i2"), ("velocity", "<i4"), ("position", "<i4"), ("between", "V10"), ("temperature", "u1")
 )  # mA; 0.229 rev/min; ticks; degC
 
@@ -130,15 +130,16 @@ class DynamixelHand:
             raise HandError(f"motor ids {list(ids)}: expected different numbers from 0 to 252")
         self.port, self.ids, self.baud = port, list(ids), baud
         self._serial: Any = None
-        self._written: dict[Register, np.ndarray] = {}  # what the motors have, of what changes rarely
+        self._written: dict[Register, bytes] = {}  # what the motors have, of what changes rarely
         self._limit = np.zeros(len(ids))  # [J] mA
         self._on, self._look = False, 0  # what was commanded; reads until the next look at the motors' health
         self._health = np.zeros(len(ids), HEALTH.dtype)
 
     def connect(self) -> str:
         """See `HandDriver.connect`. Motors are set to the current-based position mode, and to answer at once."""
-        self._open()
-        self._write(TORQUE, np.zeros(len(self.ids), TORQUE.dtype))  # Settings cannot be changed otherwise.
+        self.close()
+        self._serial = open_serial(self.port, self.baud, timeout=_POLL, write_timeout=0.1)
+        self._write(TORQUE, 0)  # Settings cannot be changed otherwise.
         found = self._insist(SETTINGS)
         wanted = found.copy()
         wanted["return_delay"], wanted["operating_mode"] = 0, POSITION_BY_CURRENT
@@ -156,17 +157,17 @@ class DynamixelHand:
             self._look = 0
         self._on = targets.on
         if not targets.on:
-            self._write(TORQUE, np.zeros(len(self.ids), TORQUE.dtype))
+            self._write(TORQUE, 0)
             self._written = {}
             return
         gains = np.zeros(len(self.ids), GAINS.dtype)
         for name in ("kp", "ki", "kd"):
             gains[name] = np.clip(getattr(targets, name), 0, 16383)
-        self._keep(GAINS, gains)
+        self._write(GAINS, gains, again=False)
         # A goal above the limit would be refused, without an answer.
-        self._keep(GOAL_CURRENT, _values(GOAL_CURRENT, np.minimum(1e3 * targets.current, self._limit)))
-        self._write(GOAL_POSITION, _values(GOAL_POSITION, np.round(targets.position / _TICK) + _MIDDLE))
-        self._keep(TORQUE, _values(TORQUE, np.ones(len(self.ids))))
+        self._write(GOAL_CURRENT, np.minimum(1e3 * targets.current, self._limit), again=False)
+        self._write(GOAL_POSITION, np.round(targets.position / _TICK) + _MIDDLE)
+        self._write(TORQUE, 1, again=False)
 
     def read(self) -> DriverState | None:
         """See `HandDriver.read`."""
@@ -193,17 +194,6 @@ class DynamixelHand:
             self._serial.close()
             self._serial = None
 
-    def _open(self) -> None:
-        try:
-            import serial
-        except ImportError:
-            raise HandError(f"pyserial is missing: {install_line('real')}") from None
-        self.close()
-        try:
-            self._serial = serial.Serial(self.port, self.baud, timeout=_POLL, write_timeout=0.1, exclusive=True)
-        except PORT_ERRORS as error:
-            raise HandError(explain(self.port, error)) from None
-
     def _insist(self, register: Register) -> np.ndarray:
         """The values [J] of a register. HandError: a motor does not answer."""
         for _ in range(_TRIES):
@@ -219,7 +209,7 @@ class DynamixelHand:
     def _read(self, register: Register) -> tuple[np.ndarray | None, bool]:
         """The values [J] of a register, None unless all motors answer in time; and whether one reports an alert."""
         size = register.dtype.itemsize
-        request = packet(BROADCAST, READ_ALL, _span(register) + bytes(self.ids))
+        request = packet(BROADCAST, READ_ALL, register.span + bytes(self.ids))
         self._serial.reset_input_buffer()
         self._serial.write(request)
         until = time.monotonic() + 10 * (len(request) + len(self.ids) * (size + 11)) / self.baud + _MARGIN
@@ -235,24 +225,11 @@ class DynamixelHand:
         data = b"".join(answers[motor].data for motor in self.ids)
         return np.frombuffer(data, register.dtype), any(answer.error & ALERT for answer in answers.values())
 
-    def _write(self, register: Register, values: np.ndarray) -> None:
-        """Write the values [J] of a register; motors do not answer it."""
-        rows = b"".join(bytes([motor]) + value.tobytes() for motor, value in zip(self.ids, values, strict=True))
-        self._serial.write(packet(BROADCAST, WRITE_ALL, _span(register) + rows))
-
-    def _keep(self, register: Register, values: np.ndarray) -> None:
-        """Write values [J] unless the motors have them."""
-        if register not in self._written or not np.array_equal(self._written[register], values):
-            self._write(register, values)
-            self._written[register] = values
-
-
-def _span(register: Register) -> bytes:
-    return register.address.to_bytes(2, "little") + register.dtype.itemsize.to_bytes(2, "little")
-
-
-def _values(register: Register, values: np.ndarray) -> np.ndarray:
-    """An array [J] of a register with one field."""
-    array = np.zeros(len(values), register.dtype)
-    array["value"] = values
-    return array
+    def _write(self, register: Register, values: np.ndarray | float, again: bool = True) -> None:
+        """Write the values [J] of a register, not `again` if the motors have them; motors do not answer it."""
+        content = np.zeros(len(self.ids), register.dtype)
+        content[:] = values
+        rows = b"".join(bytes([motor]) + value.tobytes() for motor, value in zip(self.ids, content, strict=True))
+        if again or self._written.get(register) != rows:
+            self._serial.write(packet(BROADCAST, WRITE_ALL, register.span + rows))
+            self._written[register] = rows

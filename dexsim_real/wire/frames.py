@@ -170,39 +170,27 @@ class Parser:
         return len(self._buffer)
 
     def _scan(self, final: bool) -> list[Frame]:
-        buffer, found, at = self._buffer, [], 0
-        while (head := buffer.find(HEAD, at)) >= 0:
-            at = head
-            end = self._frame_end(at)
-            if end is not None and end > len(buffer) and not final:
+        buffer, found, at, done = self._buffer, [], 0, 0
+        while (at := buffer.find(HEAD, at)) >= 0:
+            end = at + OVERHEAD  # of this frame, as far as its header has arrived
+            if len(buffer) >= at + HEADER.size:
+                _, source, target, command, size = HEADER.unpack_from(buffer, at)
+                end = end + size if size in self._lengths.get(command, ()) else at
+            if end > len(buffer) and not final:
                 break
-            frame = None if end is None or end > len(buffer) else self._take(at, end)
-            found += [frame] if frame else []
-            at = end if frame and end else at + 1
+            whole = bytes(buffer[at:end]) if end <= len(buffer) else b""
+            at += 1  # From here, unless the frame is sound.
+            if whole and crc16(whole[:-2]) == int.from_bytes(whole[-2:], "little"):
+                self.frames += 1
+                found.append(Frame(source, target, command, whole[HEADER.size : -2]))
+                at = done = end
+            elif whole:
+                self.crc_errors += 1
         else:
             # The last byte may be the first half of a head.
-            at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > at)
+            at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > done)
         del buffer[:at]
         return found
-
-    def _frame_end(self, at: int) -> int | None:
-        """End of the frame that begins here, as far as its header has arrived; None when there is no such frame."""
-        buffer = self._buffer
-        if len(buffer) < at + HEADER.size:
-            return at + OVERHEAD
-        _, _, _, command, size = HEADER.unpack_from(buffer, at)
-        span = self._lengths.get(command)
-        return at + OVERHEAD + size if span is not None and size in span else None
-
-    def _take(self, at: int, end: int) -> Frame | None:
-        """The frame in these bytes; None for a wrong checksum."""
-        whole = bytes(self._buffer[at:end])
-        if crc16(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
-            self.crc_errors += 1
-            return None
-        self.frames += 1
-        _, source, target, command, _ = HEADER.unpack_from(whole)
-        return Frame(source, target, command, whole[HEADER.size : -2])
 
 
 def command_block(

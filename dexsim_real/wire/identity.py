@@ -5,7 +5,7 @@ The vendor's header names register 20 (side of the hand) and 21 (serial number, 
 what the emulated hand sends: the register's number in two bytes, low byte first, then its content.
 """
 
-import dataclasses
+from typing import NamedTuple
 
 from dexsim.calibration.maps import Calibration
 from dexsim.hand.description import Hand
@@ -16,53 +16,45 @@ SIDE, SERIAL_NUMBER = 20, 21
 _WORDS = {"l": "left", "left": "left", "r": "right", "right": "right", "2l32": "left", "2r32": "right"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Identity:
+class Identity(NamedTuple):
     """What a hand tells about itself; a field is empty if it does not."""
 
     serial_number: str = ""
     handedness: str = ""  # "left", "right", or "code N" when the meaning of the answer is not known
 
-    def describe(self) -> str:
-        """Both in a few words."""
+    def __str__(self) -> str:
         return f"{self.handedness or 'unknown side'}, serial number {self.serial_number or 'unknown'}"
 
 
-def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
-    """The identity in the contents of the two registers; None for one that the hand did not answer."""
-    text = printable(serial_number or b"")
-    if side is None and not text:
-        return Identity()
-    for word in (printable(side or b""), text[:4]):
-        if word.lower() in _WORDS:
-            return Identity(text, _WORDS[word.lower()])
-    return Identity(text, f"code {side[0]}" if side else "")
+def read_identity(serial_number: bytes, side: bytes) -> Identity:
+    """The identity in the contents of the two registers; empty for one that the hand did not answer."""
+    text = printable(serial_number)
+    known = [_WORDS[word] for word in (printable(side).lower(), text[:4].lower()) if word in _WORDS]
+    return Identity(text, known[0] if known else f"code {side[0]}" if side else "")
 
 
-def check_identity(identity: Identity | None, hand: Hand, calibration: Calibration | None = None) -> list[str]:
+def check_identity(identity: Identity, hand: Hand, calibration: Calibration | None = None) -> list[str]:
     """Check that a hand fits the model and the calibration; returns notes about what could not be checked.
 
-    `identity` is None if the port cannot tell it. Raises HandError: it is another hand.
+    Raises:
+      HandError: it is another hand.
     """
-    serial, side = (identity.serial_number, identity.handedness.lower()) if identity else ("", "")
+    serial, side = identity
     if side in ("left", "right") and side != hand.side:
         raise HandError(f"this is a {side} hand (serial number {serial}), the model a {hand.side} one: see --hand")
-    expected = calibration.serial if calibration else ""
-    if expected and not serial:
+    known = (calibration.serial, calibration.handedness) if calibration else ("", "")
+    if known[0] and serial != known[0]:
+        this = f"this is hand {serial}" if serial else "the hand does not tell its serial number"
         raise HandError(
-            f"the hand does not tell its serial number, and the calibration is of hand {expected}: calibrate this "
-            "hand, or remove the serial number from the file if it is this hand's"
+            f"{this}, the calibration is of hand {known[0]}: calibrate this hand, or remove the serial number from the "
+            "file if it is this hand's"
         )
-    if expected and serial != expected:
-        raise HandError(f"this is hand {serial}, the calibration is of hand {expected}: calibrate this hand")
-    if calibration and calibration.handedness and side and side != calibration.handedness:
-        raise HandError(
-            f"this hand is {side}, the calibration is of a {calibration.handedness} one: calibrate this hand"
-        )
+    if known[1] and side and side != known[1]:
+        raise HandError(f"this hand is {side}, the calibration is of a {known[1]} one: calibrate this hand")
     notes = []
     if not serial:
         notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
-    elif calibration and not expected:
+    elif calibration and not known[0]:
         notes.append("the calibration names no serial number: it may be of another hand")
     if side.startswith("code"):
         notes.append(f"the hand gives its side as {side}, whose meaning is not known")

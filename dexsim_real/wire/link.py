@@ -15,7 +15,11 @@ from dexsim.core.config import Config, Range, setting
 from dexsim.hand.description import Hand
 from dexsim_real.wire.identity import Identity, check_identity
 
+UNCONFIRMED = "the hand did not confirm that its motors are off"
+PATIENCE = 5.0  # s for which a hand whose motors may be on and that does not answer is told to turn them off
+BRIEF = 0.3  # s, the same for a hand that was off already
 _PAUSE = 0.002  # s, of a call while the hand is gone
+_AGAIN = 0.01  # s after an error of the port, until it is told again to turn the motors off
 BITS_PER_BYTE = 10  # 8N1
 _BASE = 1501000
 _NAMES = {
@@ -131,7 +135,7 @@ class HandPort:
     """The interface of a hand. `exchange` is called from one thread only."""
 
     counts: LinkCounts
-    identity: Identity | None = None  # None where the port cannot tell it
+    identity = Identity()  # what the hand tells about itself
     refusal: Refusal | None = None  # why the newest exchange was refused
 
     @property
@@ -168,6 +172,19 @@ class HandPort:
     def close(self) -> None:
         """Close the port, motors as they are; no error where it is closed already."""
         raise NotImplementedError
+
+    def turn_off(self, command: np.ndarray, seconds: float) -> bool:
+        """Send a command with all motors off until the hand answers it, over a lost cable too; a port that fails is
+        asked again. Gives up after so many `seconds`; returns whether the hand has confirmed it."""
+        until = time.monotonic() + seconds
+        while True:
+            try:
+                if isinstance(self.exchange(command), Reply):
+                    return True
+            except (Exception, SystemExit):  # Of a driver from elsewhere, which may work again.
+                time.sleep(_AGAIN)
+            if time.monotonic() > until:
+                return False
 
 
 class ReconnectingPort(HandPort):

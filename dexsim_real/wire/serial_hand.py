@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.install import install_line
 from dexsim.hand.description import Hand
-from dexsim_real.core.errors import PORT_ERRORS, HandError, explain, find_function
+from dexsim_real.core.errors import HandError, find_function, open_serial
 from dexsim_real.wire import frames
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
@@ -40,7 +39,6 @@ class SerialHand(ReconnectingPort):
     def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
         super().__init__(config or LinkConfig(), passive_command(), **options)
         self.port = port
-        self.identity: Identity = Identity()
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
@@ -52,7 +50,7 @@ class SerialHand(ReconnectingPort):
         self._open()
         try:
             self._sleep(self.config.settle)
-            version = self._greet(self.config.handshake)
+            version = self._handshake(self.config.handshake)
             self.identity = self._read_identity()
         except HandError:
             self.close()
@@ -60,7 +58,7 @@ class SerialHand(ReconnectingPort):
         except OSError as error:
             self.close()
             raise HandError(f"{self.port}: the connection failed in the handshake ({error}); check the cable") from None
-        return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
+        return f"{self.port}: hand {self.config.hand_id}, {self.identity}, firmware {version}"
 
     def close(self) -> None:
         """See `HandPort.close`."""
@@ -172,27 +170,15 @@ class SerialHand(ReconnectingPort):
     # --- opening and reopening --------------------------------------------------------------
 
     def _open(self) -> None:
-        try:
-            import serial
-        except ImportError:
-            raise HandError(f"pyserial is missing: {install_line('real')}") from None
         self.close()
-        local = "://" not in self.port
-        try:
-            options = {"exclusive": True} if local else {}
-            self._serial = serial.serial_for_url(
-                self.port, baudrate=self.config.baud, timeout=_POLL, write_timeout=_WRITE, **options
-            )
-        except PORT_ERRORS as error:
-            raise HandError(explain(self.port, error)) from None
-        if local:
-            # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
-            with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
-                self._serial.set_low_latency_mode(True)
+        self._serial = open_serial(self.port, self.config.baud, timeout=_POLL, write_timeout=_WRITE)
+        # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            self._serial.set_low_latency_mode(True)
         self._parser.expire()
         self._received, self._connected = 0, True
 
-    def _greet(self, patience: float) -> str:
+    def _handshake(self, patience: float) -> str:
         """Handshake: ask for the version and one state with the motors off. The version may stay unknown."""
         until, version = self._clock() + patience, "unknown"
         self._generation += 1
@@ -208,8 +194,8 @@ class SerialHand(ReconnectingPort):
     def _read_identity(self) -> Identity:
         return read_identity(self._register(SERIAL_NUMBER), self._register(SIDE))
 
-    def _register(self, number: int) -> bytes | None:
-        """Content of a register; None when the hand does not tell."""
+    def _register(self, number: int) -> bytes:
+        """Content of a register; empty when the hand does not tell."""
         name = number.to_bytes(2, "little")
         for _ in range(_ATTEMPTS):
             frame, _ = self._request(Command.READ_REGISTER, name, _REGISTER)
@@ -217,14 +203,7 @@ class SerialHand(ReconnectingPort):
                 return frame.data[len(name) :]
             if self.refusal is not None:
                 break
-        return None
-
-    def _recognise(self) -> None:
-        """Raises HandError: the hand is not the one from before, or does not tell."""
-        if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
-            text = f"another hand is on {self.port}: {identity.describe()}, not {self.identity.describe()}"
-            self.refusal = Refusal(text, serious=True)
-            raise HandError(text)
+        return b""
 
     def _silence(self) -> str:
         """Why there is no valid answer, and what to do."""
@@ -251,10 +230,13 @@ class SerialHand(ReconnectingPort):
     def _reopen(self) -> None:
         try:
             self._open()
-            self._greet(0.0)
-            self._recognise()
+            self._handshake(0.0)
         except HandError as error:
             raise OSError from error
+        if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
+            text = f"another hand is on {self.port}: {identity}, not {self.identity}"
+            self.refusal = Refusal(text, serious=True)
+            raise OSError(text)
 
 
 def check_wire(hand: Hand) -> None:

@@ -169,10 +169,9 @@ def calibration() -> None:
     from calibrating import operator
     from press_plant import PressBench
 
-    from dexsim.calibration.maps import load_calibration
+    from dexsim.calibration.maps import load_calibration, torque_constants
     from dexsim_real.calibrate.__main__ import fit_and_report, record
     from dexsim_real.calibrate.options import CalibrateArguments
-    from dexsim_real.calibrate.press_fit import torque_constants
     from dexsim_real.twin.virtual import VirtualPort
 
     hand = dexsim.load_hand()
@@ -191,7 +190,7 @@ def calibration() -> None:
         )
         log = record(options, hand, operator(), port=port, clock=port.clock, sleep=port.sleep)
         fit_and_report(options, hand, [log], operator())
-        constants = np.abs(torque_constants(load_calibration(options.output, hand)).mean(0))
+        constants = np.abs(torque_constants(load_calibration(options.output, hand))[0].mean(0))
     truth = bench.truth()
     for name in ("index_joint1", "index_joint2"):
         joint = hand.joint_names.index(name)

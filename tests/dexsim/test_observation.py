@@ -23,7 +23,7 @@ from dexsim.observation import (
     Readings,
     layout,
 )
-from dexsim_real.sensors.readings import sources_of
+from dexsim_real.control.controller import sources_of
 
 TIPS = ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip")
 observe = jax.jit(observation.observe, static_argnums=(0, 2, 3))

@@ -27,4 +27,4 @@ def jax_as_it_is(monkeypatch, controller_of):
     """Runs within the tests' process leave the flags that other tests compile with alone."""
     monkeypatch.setattr("dexsim_real.run.session.Controller", controller_of)
     monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
-    monkeypatch.setattr("dexsim_real.replay.__main__.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.replay.prepare_jax", lambda: None)

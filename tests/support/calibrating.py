@@ -5,7 +5,6 @@ import queue
 
 import numpy as np
 from press_bench import Plate
-from rich.console import Console
 
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.bench import Operator
@@ -14,7 +13,7 @@ from dexsim_real.calibrate.plan import placements
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.frames import Mode
 
-SHORT = PressConfig(cycles=3, seconds=5.0, approach_speed=0.3, first_speed=0.08)
+SHORT = PressConfig(cycles=3, seconds=4.0, approach_speed=0.3, first_speed=0.08)
 
 QUICK = PressConfig(cycles=1, seconds=1.0, approach_speed=0.5, first_speed=0.2, pause=0.2)
 
@@ -47,7 +46,7 @@ def arguments(folder, **options):
 
 
 def operator():
-    return Operator(Console(file=io.StringIO(), width=200), assume_yes=True)
+    return Operator(io.StringIO(), assume_yes=True)
 
 
 class Typist(io.StringIO):
@@ -73,7 +72,7 @@ class Typist(io.StringIO):
         return False
 
     def operator(self):
-        return Operator(Console(file=self, width=200), stream=self)
+        return Operator(self, stream=self)
 
 
 def record(bench, hand, options, who=None):

@@ -8,7 +8,7 @@ OPTIONS = {
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),
     "dexsim_real.twin": ("dexsim_real.twin.__main__:TwinArguments", []),
-    "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
+    "dexsim_real.replay": ("dexsim_real.replay:ReplayArguments", ["x.log"]),
     "dexsim.check_hand": ("dexsim.check_hand:CheckHandArguments", ["leap_like"]),
     "dexsim.import_hand": ("dexsim.import_hand:ImportArguments", ["hand.urdf", "--out", "x"]),
     "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),

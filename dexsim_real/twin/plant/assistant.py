@@ -81,17 +81,12 @@ class Place(NamedTuple):
     position: np.ndarray  # [3] m
     quat: np.ndarray  # [4]
     velocity: np.ndarray  # [3] m/s
-
-    @property
-    def shelf(self) -> np.ndarray:
-        """Where [3] m the object waits."""
-        return self.position + _SHELF
+    shelf: np.ndarray  # [3] m, where the object waits
 
 
-def sample_place(
+def _sample_place(
     parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, start: Start
 ) -> Place:
-    """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
     if parameters.task != "grasp":
         quat = turn((1.0, 0.0, 0.0), parameters.heading_error * rng.uniform(-1, 1))
         shift = parameters.place_error * rng.uniform(-1, 1, 2)
@@ -106,7 +101,7 @@ def sample_place(
         gap, speed = parameters.gap, parameters.release_speed
     up = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
     position = np.array([face + gap + shape.reach(up), *(start.place + shift)])
-    return Place(position, quat, np.array([speed, 0.0, 0.0]))
+    return Place(position, quat, np.array([speed, 0.0, 0.0]), position + _SHELF)
 
 
 def find_place(
@@ -117,11 +112,12 @@ def find_place(
     face: float,
     start: Start,
 ) -> Place | None:
-    """Sample a release pose that the hand in its start posture leaves clear; None if there seems to be none."""
+    """Sample a release pose of the object over a palm at x = `face` m that the fingers in the start posture leave
+    clear; None if there seems to be none."""
     data = mujoco.MjData(scene.model)
     scene.set_joints(data, start.posture)
     for _ in range(_PLACES):
-        place = sample_place(parameters, shape, rng, face, start)
+        place = _sample_place(parameters, shape, rng, face, start)
         put(scene, data, place.position, place.quat)
         mujoco.mj_kinematics(scene.model, data)
         mujoco.mj_collision(scene.model, data)

@@ -338,7 +338,7 @@ class EmulatedHand:
         if command is not None and np.all(command["mode"] == Mode.POSITION):
             targets = command["position"].astype(float)
         if self._assistant.watch(self.time, targets, self._joints) is Stage.FREE:
-            put(self._scene, self._data, *self._place)
+            put(self._scene, self._data, *self._place[:3])
             self._pushes.begin(self.time)
 
 

@@ -52,14 +52,15 @@ class Look(NamedTuple):
     limited: bool  # a joint is at its torque limit
     disturbed: bool  # a push acts on the object
 
+    @property
+    def touching(self) -> int:
+        """Number of fingertips that touch the object."""
+        return int(np.sum(self.force > TOUCH))
 
-class _Moment(NamedTuple):
-    """What may tell the cause of a loss."""
-
-    time: float  # s
-    touching: int  # fingertips
-    tilt: float  # rad
-    look: Look
+    @property
+    def tilt(self) -> float:
+        """Angle rad between the object's x and the palm's normal."""
+        return math.acos(float(np.clip(matrix(self.quat)[:, 0] @ _AXIS, -1.0, 1.0)))
 
 
 class Referee:
@@ -92,7 +93,7 @@ class Referee:
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self.goals = dict.fromkeys(_FASTEST, 0)  # consecutive ones, by whose count
         self._heading: float | None = None  # rad, at the release
-        self._moments: collections.deque[_Moment] = collections.deque()
+        self._looks: collections.deque[tuple[float, Look]] = collections.deque()  # and their times s
         self._gripped = False  # whether two fingertips ever touched at once
 
     def watch(self, step: float, look: Look) -> None:
@@ -100,17 +101,15 @@ class Referee:
         if self.end:
             return
         self.time += step
-        touching = int(np.sum(look.force > TOUCH))
         self._speed += step * float(np.mean(np.abs(look.joint_speed)))
-        if touching:
+        if look.touching:
             self._touched = self.time
         away = float(np.linalg.norm(look.position - self._reference))
-        tilt = math.acos(float(np.clip(matrix(look.quat)[:, 0] @ _AXIS, -1.0, 1.0)))
-        self._gripped |= touching >= 2
-        self._moments.append(_Moment(self.time, touching, tilt, look))
-        while self._moments[0].time < self.time - _TRAP:
-            self._moments.popleft()
-        if away > LOST[self.task] or (self.task == "rotate" and tilt > TIPPED):
+        self._gripped |= look.touching >= 2
+        self._looks.append((self.time, look))
+        while self._looks[0][0] < self.time - _TRAP:
+            self._looks.popleft()
+        if away > LOST[self.task] or (self.task == "rotate" and look.tilt > TIPPED):
             self.end = f"dropped: {self._cause(away)}"
             return
         if self.task == "rotate":
@@ -129,12 +128,12 @@ class Referee:
 
     def _cause(self, away: float) -> str:
         """Why the object is lost, which now is `away` m from its place; see the head of this module."""
-        last = [moment for moment in self._moments if moment.time >= self.time - _LEAD]
-        touched = [moment.look.limited for moment in last if moment.touching]
-        trapped = [moment.tilt > _TRAPPED and moment.touching <= 1 for moment in self._moments]
+        last = [look for time, look in self._looks if time >= self.time - _LEAD]
+        touched = [look.limited for look in last if look.touching]
+        trapped = [look.tilt > _TRAPPED and look.touching <= 1 for _, look in self._looks]
         if not self._gripped:
             return "untouched"
-        if any(moment.look.disturbed for moment in last):
+        if any(look.disturbed for look in last):
             return "disturbed"
         if self.task == "rotate" and self.time > _TRAP and np.mean(trapped) > 0.7:
             return "trapped"
@@ -167,8 +166,8 @@ class Referee:
             "end": self.end or "running",
             "joint_speed": round(self._speed / lived, 4),
         }
-        if self.end.startswith("dropped") and self._moments:
-            before = next(moment.look for moment in self._moments if moment.time >= self.time - _LEAD)
+        if self.end.startswith("dropped") and self._looks:
+            before = next(look for time, look in self._looks if time >= self.time - _LEAD)
             poses = {
                 "joint_position": before.joint_position,
                 "object_position": before.position,

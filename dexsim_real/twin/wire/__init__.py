@@ -1,1 +1,1 @@
-"""The emulated hand's end of the wire: firmware, timing, faults, sensors of the object."""
+"""The emulated hand's end of the wire: firmware, timing, sensors of the object."""

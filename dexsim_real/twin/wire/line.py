@@ -1,4 +1,4 @@
-"""The emulated hand's end of the line: bytes with the timing of RS485, and injected faults.
+"""The emulated hand's end of the line: bytes with the timing of RS485.
 
 An exchange takes as long as on the real hand: the bytes of the request at 3 Mbaud, a delay in the palm board, and the
 bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The constants are measured on a hand (mean
@@ -8,17 +8,16 @@ bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The co
 import contextlib
 import os
 import tty
-from collections import Counter
-from collections.abc import Callable, Generator
+from collections import Counter, deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.faults import LINE, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Parser
+from dexsim_real.wire.frames import Frame, Parser
 from dexsim_real.wire.link import BITS_PER_BYTE
 
 BAUD = 3_000_000
@@ -29,7 +28,7 @@ _SILENCE = 0.003  # s without a byte after which an incomplete request is droppe
 
 
 class Terminal:
-    """A pseudo-terminal that can be disconnected and reconnected. `name` is a link to the current terminal.
+    """A pseudo-terminal; `name` is a link to it.
 
     Args:
       link: path of the link.
@@ -44,10 +43,6 @@ class Terminal:
         ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
         if self.name.exists() and not ours:
             raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
-        self.open()
-
-    def open(self) -> None:
-        """Connect: create a terminal and the link to it."""
         try:
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)
@@ -64,17 +59,13 @@ class Terminal:
 
     def close(self) -> None:
         """Disconnect: programs that have the terminal open get an error."""
-        if self.connected:
+        if self._master >= 0:
             with contextlib.suppress(OSError):
                 if os.readlink(self.name) == os.ttyname(self._slave):
                     self.name.unlink()
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
-
-    @property
-    def connected(self) -> bool:
-        return self._master >= 0
 
     def fileno(self) -> int:
         return self._master
@@ -98,96 +89,62 @@ class HandLine:
     Args:
       terminal: the hand's end of the cable.
       firmware: executes the requests.
-      injector: decides the faults.
       seed: of the delays.
       catch_up: called with a time s before the hand acts, to advance the plant to that time.
-      note: called with one line for every event.
     """
 
     def __init__(
         self,
         terminal: Terminal,
         firmware: Firmware,
-        injector: Injector,
         *,
         seed: int = 0,
         catch_up: Callable[[float], None] = lambda now: None,
-        note: Callable[[str], None] = lambda text: None,
     ):
-        self.terminal, self.firmware, self.injector = terminal, firmware, injector
+        self.terminal, self.firmware = terminal, firmware
         self.counts: Counter[str] = Counter()
-        self._catch_up, self._note = catch_up, note
+        self._catch_up = catch_up
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
-        self._work: Generator[float, float, None] | None = None  # on a request; None while there is none
-        self._due, self._heard = np.inf, -np.inf
+        self._tasks: deque[tuple[float, Frame | bytes]] = deque()  # when (s): a request to execute, bytes to send
+        self._heard = -np.inf
 
     def due(self) -> float:
         """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
-        return self._due
+        return self._tasks[0][0] if self._tasks else np.inf
 
     def serve(self, now: float) -> None:
         """Do what is due."""
-        for frame in self._listen(now) if self.terminal.connected else ():
-            self.counts["requests"] += 1
-            if self._work:  # It cannot listen and talk on one pair of wires.
-                self.counts["ignored"] += 1
-            else:
-                self._work = self._answer(now, frame)
-                self._due = next(self._work)
-        while self._work and self._due <= now:
-            try:
-                self._due = self._work.send(now)
-            except StopIteration:
-                self._work, self._due = None, np.inf
-
-    def _listen(self, now: float) -> list[Frame]:
-        data = self.terminal.read()
-        if not data:
-            if now - self._heard > _SILENCE:
-                self._parser.expire()
-            return []
-        self._heard = now
-        return self._parser.feed(data)
-
-    def _answer(self, now: float, frame: Frame) -> Generator[float, float, None]:
-        """Execute and answer a request, with at most one fault; yields when it goes on (s), and gets the time."""
-        extra = self._rng.uniform(0.0, EXTRA_DELAY) if self._rng.random() < EXTRA_PROBABILITY else 0.0
-        delay = max(PROCESSING + JITTER * self._rng.standard_normal(), 0.0) + extra
-        due = now + _on_wire(len(frame.encode())) + delay
-        now = yield due
-        fault = self.injector.sample(now) if frame.command == Command.EXCHANGE else None
-        kind = fault.kind if fault else ""
-        if fault and kind != "flip":
-            self._note(f"fault {kind} {' '.join(f'{value:g}' for value in fault.values.values())}")
-        if fault and kind == "disconnect":
-            self.terminal.close()
+        data, rng = self.terminal.read(), self._rng
+        if not data and now - self._heard > _SILENCE:
             self._parser.expire()
-            yield now + fault.values["seconds"]
-            self.terminal.open()
-            self._note("reconnected")
-            return
-        if fault and kind == "stall":
-            self.counts["ignored"] += 1
-            yield now + fault.values["seconds"]
-            return
-        if fault and kind not in LINE:
-            self.firmware.begin(fault, now)
+        self._heard = now if data else self._heard
+        for frame in self._parser.feed(data):
+            self.counts["requests"] += 1
+            if self._tasks:  # It cannot listen and talk on one pair of wires.
+                self.counts["ignored"] += 1
+                continue
+            extra = rng.uniform(0.0, EXTRA_DELAY) if rng.random() < EXTRA_PROBABILITY else 0.0
+            delay = max(PROCESSING + JITTER * rng.standard_normal(), 0.0) + extra
+            self._tasks.append((now + _on_wire(len(frame.encode())) + delay, frame))
+        while self._tasks and self._tasks[0][0] <= now:
+            due, task = self._tasks.popleft()
+            if isinstance(task, Frame):
+                self._execute(task, due, now)
+            else:
+                self.terminal.write(task)
+
+    def _execute(self, request: Frame, due: float, now: float) -> None:
+        """Execute a request that was due at a time, and plan the bytes of its answer."""
         self._catch_up(now)
-        answer = self.firmware.answer(frame, now)
+        answer = self.firmware.answer(request)
         if answer is None:
             return
         data = answer.encode()
         # From when it was due: a late machine catches up during the transfer.
         start = max(due, now - _on_wire(len(data)) / 2)
-        if fault and kind == "late":
-            start += fault.values["seconds"]
-        if kind == "flip":
-            data = self.injector.damage(data)
-        self.counts["damaged answers" if kind == "flip" else "answers"] += 1
-        for at in range(0, len(data), CHUNK):
-            chunk = data[at : at + CHUNK]
-            yield start + _on_wire(at + len(chunk))
-            self.terminal.write(chunk)
+        self.counts["answers"] += 1
+        for end in [*range(CHUNK, len(data), CHUNK), len(data)]:
+            self._tasks.append((start + _on_wire(end), data[(end - 1) // CHUNK * CHUNK : end]))
 
 
 def _on_wire(size: int) -> float:

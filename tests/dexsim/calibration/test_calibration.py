@@ -1,7 +1,8 @@
-"""Current to torque: robust lines against references, a motor of known truth, the file, refusals."""
+"""Current to torque: robust lines against references, a motor of known truth, the file, what no hand gives."""
 
 import dataclasses
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +11,26 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from virtual_press import press, varied_presses
 
 from dexsim.actuator.current import Motor
-from dexsim.calibration.fit import calibrate
-from dexsim.calibration.joint import JointPress, find_direction, find_presses, fit_joint
+from dexsim.calibration.fit import JointPress, calibrate, fit_joint
 from dexsim.calibration.line import fit_line
 from dexsim.calibration.maps import (
-    alignment,
+    Calibration,
+    Side,
+    calibrated_hand,
     joint_torque,
     load_calibration,
     normalise,
+    normalised_torque,
     save_calibration,
     taxel_force,
 )
-from dexsim.calibration.plot import plot_calibration
 from dexsim.calibration.press import lever_arms
+from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
 
 # --- lines -----------------------------------------------------------------------------------
@@ -37,52 +42,44 @@ def ar1(rng, count, rho):
     return scipy.signal.lfilter([1.0], [1.0, -rho], white)
 
 
-def holds(interval, truth):
-    return interval[0] <= truth <= interval[1]
+def holds(line, gain, offset):
+    return abs(line.gain - gain) <= line.gain_error, abs(line.offset - offset) <= line.offset_error
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])
 def test_intervals_hold_the_truth(rho):
     """Recordings of 400 samples; autocorrelation at a rising force is the hard case. The value is least squares'."""
-    rng, hits, off = np.random.default_rng(2), np.zeros(2), []
-    x = np.linspace(0, 8, 400)
-    for _ in range(200):
+    rng, hits, off = np.random.default_rng(2), [], []
+    x, one = np.linspace(0, 8, 400), np.zeros(400, int)
+    for _ in range(60):
         y = 0.05 * x + 0.3 + 0.02 * ar1(rng, 400, rho)
-        line, reference = fit_line(x, y), scipy.stats.linregress(x, y)
-        hits += holds(line.gain_interval, 0.05), holds(line.offset_interval, 0.3)
+        line, reference = fit_line(x, y, one), scipy.stats.linregress(x, y)
+        hits.append(holds(line, 0.05, 0.3))
         off.append((line.gain - reference.slope) / reference.stderr)
-    assert np.all(hits / 200 >= 0.9) and np.all(hits / 200 <= 0.985)
+    assert np.all(np.mean(hits, 0) >= 0.9)
+    assert line.gain_error < 8 * reference.stderr  # that of independent errors
     assert np.std(off) < 0.4 and line.r_squared == pytest.approx(reference.rvalue**2, abs=0.01)
 
 
-@pytest.mark.parametrize("kind", ["random", "one-sided", "dropped"])
+@pytest.mark.parametrize("kind", ["one-sided", "dropped"])
 def test_gain_within_two_percent_at_five_percent_outliers(kind):
-    """100 recordings each; outliers of up to 20 times the noise, all to one side, or reads of 0."""
-    rng, worst = np.random.default_rng(4), 0.0
-    x = np.linspace(0.5, 8, 300)
-    for _ in range(100):
+    """Outliers of up to 20 times the noise, all to one side, or reads of 0."""
+    rng, x = np.random.default_rng(4), np.linspace(0.5, 8, 300)
+    for _ in range(40):
         y = 0.05 * x + 0.02 + 0.01 * rng.standard_normal(300)
         bad = rng.permutation(300)[:15]
-        if kind == "dropped":
-            y[bad] = 0.0
-        else:
-            spike = rng.uniform(0.05, 0.2, 15)
-            y[bad] += spike if kind == "one-sided" else spike * rng.choice([-1, 1], 15)
-        worst = max(worst, abs(fit_line(x, y).gain / 0.05 - 1))
-    assert worst < 0.02
+        y[bad] = 0.0 if kind == "dropped" else y[bad] + rng.uniform(0.05, 0.2, 15)
+        assert fit_line(x, y, np.zeros(300, int)).gain == pytest.approx(0.05, rel=0.02)
 
 
 def test_intervals_hold_the_truth_where_presses_differ():
-    hits = np.zeros(2)
-    for seed in range(100):
-        force, value = varied_presses(np.random.default_rng(seed), gain=0.05, offset=0.02)
-        line = fit_line(force, value, find_presses(force))
-        hits += holds(line.gain_interval, 0.05), holds(line.offset_interval, 0.02)
-        plain = fit_line(force, value)
-    assert np.all(hits >= 88) and plain.gain_share < line.gain_share
-    # What no sample shows is added in quadrature.
-    assert line.widened(0.3).gain_share == pytest.approx(np.hypot(line.gain_share, 0.3))
-    assert line.widened(0.3).offset_interval == line.offset_interval
+    hits = []
+    for seed in range(40):
+        force, value = varied_presses(np.random.default_rng(seed))
+        line = fit_line(force, value, find_swings(force)[1])
+        hits.append(holds(line, 0.05, 0.02))
+    assert np.all(np.mean(hits, 0) >= 0.88)
+    assert fit_line(force, value, np.zeros(len(force), int)).gain_error <= line.gain_error
 
 
 # --- a motor of known truth --------------------------------------------------------------------
@@ -108,20 +105,37 @@ def recording(seed=0, motor=MOTOR, **options):
 
 def test_both_lines_of_a_motor_with_losses():
     """Loading: F lever / (K eta_f) + i0 + bias; unloading: F lever eta_b / K - i0 + bias."""
-    hits, runs = np.zeros(4), 60
-    for seed in range(runs):
+    hits, gain, offset = [], np.array([LEVER / (0.9 * 0.8), LEVER * 0.7 / 0.9]), np.array([0.024, -0.016])
+    for seed in range(20):
         phase = seed * 2.399963  # rad, the ripple's place at the start differs from day to day
-        fit = fit_joint(recording(seed, dataclasses.replace(MOTOR, ripple_phase=phase)), "A")
-        truth = {"loading": (LEVER / (0.9 * 0.8), 0.024), "unloading": (LEVER * 0.7 / 0.9, -0.016)}
-        for k, name in enumerate(truth):
-            line, (gain, offset) = getattr(fit, name), truth[name]
-            assert line.gain == pytest.approx(gain, rel=0.02)
-            hits[2 * k] += line.gain_interval[0] <= gain <= line.gain_interval[1]
-            hits[2 * k + 1] += line.offset_interval[0] <= offset <= line.offset_interval[1]
+        data = recording(seed, dataclasses.replace(MOTOR, ripple_phase=phase))
+        lines, _ = fit_joint(data, "A")
+        np.testing.assert_allclose(lines.gain, gain, rtol=0.02)
+        hits.append(np.abs([lines.gain - gain, lines.offset - offset]) <= [lines.gain_error, lines.offset_error])
         # Half the gap at the middle force: half of the difference of the lines there.
-        gap = 4.0 * (truth["loading"][0] - truth["unloading"][0]) / 2 + 0.02
-        assert fit.friction == pytest.approx(gap, rel=0.05)
-    assert np.all(hits >= 0.9 * runs), hits
+        assert lines.friction == pytest.approx(4.0 * (gain[0] - gain[1]) / 2 + 0.02, rel=0.05)
+    assert np.all(np.sum(hits, 0) >= 18)
+    # With one direction its line stands for both.
+    one, notes = fit_joint(JointPress(data.force[:100], data.value[:100]), "A")
+    np.testing.assert_allclose(one.gain, gain[0], rtol=0.03)
+    assert one.gain_error[1] > 0.29 * gain[0] > one.gain_error[0] and np.isnan(one.friction)
+    assert [note.partition(":")[0] for note in notes] == ["moved one way only", "fewer than 3 presses"]
+    # What no sample shows is added in quadrature.
+    wider, _ = fit_joint(dataclasses.replace(data, gain_error=0.3), "A")
+    np.testing.assert_allclose(wider.gain_error, np.hypot(lines.gain_error, 0.3 * lines.gain))
+
+
+def test_a_doubtful_line_is_noted():
+    data = recording()
+    bad = np.arange(len(data.value)) % 6 == 0
+    for value, says in (
+        (data.value + 0.5 * bad, r"^loading \(A\): \d+ of \d+ samples are outliers$"),
+        (data.value + 0.15 * np.random.default_rng(0).standard_normal(len(bad)), "loading .*: hardly a line$"),
+        (data.value + 0.3 * np.random.default_rng(0).standard_normal(len(bad)), "gain known to .* % only$"),
+    ):
+        _, notes = fit_joint(dataclasses.replace(data, value=value), "A")
+        assert any(re.search(says, note) for note in notes), notes
+    assert fit_joint(data, "A")[1] == []
 
 
 def calibrated(hand, motor=MOTOR, names=None, **options):
@@ -129,7 +143,7 @@ def calibrated(hand, motor=MOTOR, names=None, **options):
     real = {name: recording(k, motor) for k, name in enumerate(names)}
     ideal = Motor(torque_constant=1.0, noise=5e-4)  # torque read as a current at 1 Nm/A
     sim = {name: recording(100 + k, ideal, force_noise=0.0) for k, name in enumerate(names)}
-    return calibrate(hand, real, sim, created="2026-01-01", **options), real, sim
+    return calibrate(hand, real, sim, **options), real, sim
 
 
 @pytest.fixture(scope="module")
@@ -156,19 +170,6 @@ def test_taxel_counts_become_newtons(fitted):
     np.testing.assert_allclose(taxel_force(calibration, counts), expected, rtol=1e-6)
 
 
-def test_alignment_tells_where_the_papers_maxima_mislead(hand):
-    """Pressed twice as hard in simulation: with proportional lines the maxima still align; with an
-    offset of a quarter of the maximum they do not, by that share."""
-    plain = Motor(torque_constant=1.0)
-    biased = Motor(torque_constant=1.0, bias=LEVER * 8.0 / 3)
-    sim = {n: recording(0, plain, peak=16.0, force_noise=0.0) for n in hand.joint_names}
-    for motor, ratio in ((plain, 1.0), (biased, 0.75)):
-        real = {n: recording(0, motor, force_noise=0.0) for n in hand.joint_names}
-        calibration = calibrate(hand, real, sim)
-        np.testing.assert_allclose(alignment(calibration), ratio, rtol=0.01)
-        assert any("maxima" in note for note in calibration.notes) == (ratio != 1.0)
-
-
 def test_joints_without_a_recording_take_their_class(hand):
     some = ("thumb_bend", "thumb_rota2", "index_joint1", "index_joint2")
     calibration, *_ = calibrated(hand, names=some)
@@ -177,8 +178,9 @@ def test_joints_without_a_recording_take_their_class(hand):
         if name not in some:
             mates = strong if hand.torque_limit[joint] > 1 else weak
             np.testing.assert_allclose(calibration.real.gain[:, joint], calibration.real.gain[:, mates].mean(1))
-            assert np.all(calibration.real.samples[:, joint] == 0)
-            assert any(note.startswith(f"{name}: not recorded") for note in calibration.notes)
+            error = calibration.real.gain_error[:, joint]
+            np.testing.assert_allclose(error, np.abs(calibration.real.gain[:, joint]))
+            assert any(name in note and "not pressed" in note for note in calibration.notes)
     with pytest.raises(CalibrationError, match="thumb_rota2: no press of a joint of 0.4 Nm"):
         calibrated(hand, names=("thumb_bend",))
     with pytest.raises(CalibrationError, match="no joint 'elbow'"):
@@ -199,20 +201,20 @@ def test_directions_of_a_noisy_triangle():
     phase = np.arange(600) / 600 * 3 % 1
     force = 8 * (1 - np.abs(2 * phase - 1)) + 0.1 * rng.standard_normal(600)
     force[rng.permutation(600)[:20]] = 0.0  # dropped reads
-    direction = find_direction(force)
+    direction, press = find_swings(force)
     assert np.mean(direction[direction != 0] == np.where(phase < 0.5, 1, -1)[direction != 0]) > 0.99
     assert 0.02 < np.mean(direction == 0) < 0.2
-    assert np.all(find_direction(np.linspace(5, 0, 100))[15:-1] == -1)
+    assert np.mean(press == np.arange(600) // 200) > 0.99
+    falling, one = find_swings(np.linspace(5, 0, 100))
+    assert np.all(falling[15:-1] == -1) and not one.any()
     # A press begins where the force rises; half a press at the beginning is one of its own.
     triangle = 8 * (1 - np.abs(2 * (np.arange(600) / 200 % 1) - 1))
-    np.testing.assert_array_equal(np.unique(find_presses(triangle)), [0, 1, 2])
-    number = find_presses(triangle[100:])
+    number = find_swings(triangle[100:])[1]
     assert list(np.unique(number)) == [0, 1, 2] and number[90] == 0 and number[110] == 1
-    assert np.all(find_presses(np.linspace(0, 5, 90)) == 0)
 
 
 BAD = {
-    "at least 20": lambda f, v: (f[:10], v[:10]),
+    "at least 20 samples": lambda f, v: (f[:10], v[:10]),
     "at least 20 samples of rising": lambda f, v: (f[:21], v[:21]),
     "one length": lambda f, v: (f[:-1], v),
     "not a number": lambda f, v: (np.where(np.arange(600) == 3, np.inf, f), v),
@@ -220,8 +222,8 @@ BAD = {
     "does not follow the force": lambda f, v: (f, 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)),
     "value stays at its maximum .* saturated": lambda f, v: (f, np.minimum(v, 0.05)),
     "force stays at its maximum .* saturated": lambda f, v: (np.minimum(f, 2.0), v),
-    "give A, not counts": lambda f, v: (f, 1000 * v),
-    "give N, not counts": lambda f, v: (1000 * f, v),
+    "give A, not another unit or counts": lambda f, v: (f, 1000 * v),
+    "give N, not another unit or counts": lambda f, v: (1000 * f, v),
     "check joint and finger names": lambda f, v: (f, v * np.where(np.arange(600) % 200 < 100, 1, -1)),
 }
 
@@ -239,8 +241,7 @@ def test_bad_recordings_are_refused_in_one_line(says):
 
 def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
     path = tmp_path / "policy" / "calibration.toml"
-    side = dataclasses.replace(fitted[0].real, friction=np.full(12, np.nan))  # a direction was not recorded
-    original = dataclasses.replace(fitted[0], real=side, serial='left "Ä"\\3')
+    original = dataclasses.replace(fitted[0], serial='left "Ä"\\3')
     save_calibration(path, original)
     back = load_calibration(path, hand)
     assert jax.tree.structure(back) == jax.tree.structure(original)
@@ -252,7 +253,7 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
     path = tmp_path / "c.toml"
     save_calibration(path, fitted[0])
     whole = path.read_bytes()
-    for length in [*range(0, len(whole) - 1, 197), *range(len(whole) - 30, len(whole) - 1)]:
+    for length in [*range(0, len(whole) - 1, 397), *range(len(whole) - 10, len(whole) - 1)]:
         path.write_bytes(whole[:length])
         with pytest.raises(CalibrationError) as caught:
             load_calibration(path, hand)
@@ -271,17 +272,135 @@ def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
         load_calibration(tmp_path / "none.toml")
 
 
-@pytest.mark.slow
-def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
-    from PIL import Image
+# --- what no hand gives -----------------------------------------------------------------------
 
-    calibration, real, sim = fitted
-    path = tmp_path / "c.png"
-    plot_calibration(path, calibration, real, sim, ("thumb_bend", "index_joint1"))
-    picture = np.asarray(Image.open(path).convert("RGB"), int)
-    assert picture.shape[1] > 800 and np.mean(np.ptp(picture, axis=-1) > 60) > 0.003
-    with pytest.raises(CalibrationError, match="nothing to draw"):
-        plot_calibration(path, calibration, {}, sim)
+
+def side(gain, offset, largest):
+    lines = (np.full((2, 12), v) for v in (gain, offset, 0.01, 0.01, 1.0))
+    return Side(*lines, *(np.full(12, v) for v in (0.02, largest, 8.0)))
+
+
+@pytest.fixture(scope="module")
+def sound(hand):
+    """Like the XHand's: 0.8 Nm/A at levers of 4 cm."""
+    return Calibration(
+        side(-0.05, 0.02, 0.5),
+        side(0.04, 0.001, 0.3),
+        np.asarray(hand.torque_limit, float),
+        np.full(5, 0.1),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+        notes=("pressed on Monday",),
+        force_per_torque=np.array([[12.0] * 5, [11.0] * 5, [13.0] * 5]),
+    )
+
+
+def changed(calibration, name, value):
+    """With other numbers, such as "real.gain", of the first joint or finger."""
+    part, _, field = name.rpartition(".")
+    owner = getattr(calibration, part) if part else calibration
+    numbers = np.array(getattr(owner, field))
+    numbers[(..., 0) if numbers.ndim else ()] = value
+    owner = dataclasses.replace(owner, **{field: numbers})
+    return dataclasses.replace(calibration, **{part: owner}) if part else owner
+
+
+def refused(path, hand):
+    """The one line that refuses a file."""
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(path, hand)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ") and "\n" not in line and len(line) < len(str(path)) + 250
+    return line.removeprefix(f"{path}: ")
+
+
+WRONG = [
+    ({"real.gain": -1e-9}, "thumb_bend: current of the full torque by real.gain = 2.75e-08"),
+    ({"real.gain": [-0.05, 0.05]}, "thumb_bend: real.gain unloading over loading = -1: must be between"),
+    ({"real.gain": np.nan}, "thumb_bend: real.gain"),
+    ({"sim.gain": 1.0}, "thumb_bend: magnitude of sim.gain = 1: must .* 0.3 Nm/N"),
+    ({"real.offset": 5.0}, "thumb_bend: share of the full torque without current"),
+    ({"torque_scale": 0.9}, "thumb_bend: torque_scale over the hand's limit = 0.8182"),
+    ({"real.force_max": 1000.0}, "thumb_bend: real.force_max = 1000: .* 100 N"),
+    ({"real.value_max": 100.0}, "thumb_bend: real.value_max = 100: .* 33 A"),
+    ({"force_per_count": 1e-9}, "thumb: force_per_count = 1e-09: must be between 0.001 and 1 N"),
+    ({"force_per_torque": 0.5}, "thumb: force_per_torque = 0.5: .* N/Nm"),
+    # Each line goes with the simulation's of its own direction, but not with the middle of both, which is used.
+    (
+        {"sim.gain": [0.0001, 0.3], "real.gain": [0.0029, 0.0085], "real.offset": [31.0, 0.03]},
+        "thumb_bend: current of the full torque by real.gain = 0.02126",
+    ),
+    (
+        {"sim.gain": [0.01, 0.19], "real.offset": [5.0, 0.02]},
+        "thumb_bend: share of the full torque without current by real.offset = 9.09",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "says"), WRONG)
+def test_numbers_that_no_hand_gives_are_refused(hand, sound, tmp_path, changes, says):
+    for name, value in changes.items():
+        sound = changed(sound, name, value)
+    save_calibration(tmp_path / "c.toml", sound)
+    assert re.search(says, refused(tmp_path / "c.toml", hand))
+
+
+DAMAGED = [
+    ("[-0.05,", f"[{10**400},", "damaged"),
+    ("[-0.05,", '["a",', "damaged"),
+    ("force_per_count = [", "force_per_count = [0.1, ", "'force_per_count' must hold 5 numbers"),
+    ("friction = ", "fiction = ", "unknown entry 'fiction'"),
+    ("version = 4", "version = 1", "expected version 4, got 1"),
+    ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
+    ('"thumb_bend"', '"thumb_bent"', "calibrate this hand"),
+    ("xhand_right", "x" * 5000, "is of hand 'x+"),
+    ("[real]", "real = 1\n[other]", "damaged"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "says"), DAMAGED)
+def test_a_damaged_file_is_refused(hand, sound, tmp_path, old, new, says):
+    path = tmp_path / "c.toml"
+    save_calibration(path, sound)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    assert re.search(says, refused(path, hand))
+
+
+def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
+    save_calibration(tmp_path / "c.toml", sound)
+    calibration = load_calibration(tmp_path / "c.toml", hand)
+    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
+    expected = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
+    np.testing.assert_allclose(calibrated_hand(hand, calibration).force_per_torque, expected)
+    # Presses from Python have none.
+    save_calibration(tmp_path / "c.toml", dataclasses.replace(sound, force_per_torque=None))
+    assert load_calibration(tmp_path / "c.toml", hand).force_per_torque is None
+
+
+NUMBERS = st.one_of(st.floats(), st.floats(-3, 3), st.sampled_from([0.0, 1e-9, 1e9]))
+PAIRS = st.one_of(NUMBERS, st.lists(NUMBERS, min_size=2, max_size=2))
+LINES = st.sampled_from(["real.gain", "real.offset", "sim.gain", "sim.offset"])
+SINGLES = st.sampled_from(["torque_scale", "force_per_count"])
+
+
+@settings(max_examples=60)
+@given(st.lists(st.one_of(st.tuples(LINES, PAIRS), st.tuples(SINGLES, NUMBERS)), min_size=1, max_size=3))
+def test_a_forged_file_is_refused_or_gives_torques_and_forces_of_a_hand(hand, sound, tmp_path_factory, changes):
+    for name, value in changes:
+        sound = changed(sound, name, value)
+    path = tmp_path_factory.getbasetemp() / "forged.toml"
+    save_calibration(path, sound)
+    try:
+        calibration = load_calibration(path, hand)
+    except CalibrationError as error:
+        assert str(error).startswith(f"{path}: ") and "\n" not in str(error)
+        return
+    idle = np.asarray(normalised_torque(calibration, np.zeros(12, np.float32)))
+    stalled = np.asarray(normalised_torque(calibration, np.full(12, 1.5, np.float32)))
+    assert np.all(np.abs(idle) < 1.01) and np.all(np.abs(stalled) < 60)
+    assert np.all(np.asarray(taxel_force(calibration, np.full((5, 1), 255.0, np.float32))) <= 255.0)
 
 
 # --- the simulation's side --------------------------------------------------------------------------

@@ -15,4 +15,4 @@ def session(hand, tmp_path_factory):
     options, who = arguments(folder, plot=folder / "hand.png"), operator()
     log = record(bench, hand, options, who)
     fit_and_report(options, hand, [log], who)
-    return bench, options, log, who.console.file.getvalue()
+    return bench, options, log, who.out.getvalue()

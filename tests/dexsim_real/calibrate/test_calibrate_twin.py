@@ -12,10 +12,9 @@ import pytest
 from calibrating import Typist, arguments, operator, record
 from paths import ROOT
 
-from dexsim.calibration.maps import load_calibration
+from dexsim.calibration.maps import load_calibration, torque_constants
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.options import PressConfig
-from dexsim_real.calibrate.press_fit import torque_constants
 
 
 def torque_of(plant, joint):
@@ -29,7 +28,7 @@ def torque_of(plant, joint):
 
 def errors(calibration, truth):
     """Share by which the middle finger's torque constants [2, 2] are off."""
-    constants = -torque_constants(calibration)
+    constants = -torque_constants(calibration)[0]
     return np.array([constants[0] / truth["loading_nm_per_a"], constants[1] / truth["unloading_nm_per_a"]])[:, 6:8] - 1
 
 

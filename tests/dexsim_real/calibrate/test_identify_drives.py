@@ -19,82 +19,19 @@ from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.twin.virtual import ideal_calibration
 
 
-def wrap(bench, change):
-    """Replace each answer by what `change` makes of it and of the number of the exchange."""
-    exchange, count = bench.exchange, [0]
-
-    def changed(command):
-        count[0] += 1
-        return change(exchange(command), count[0])
-
-    bench.exchange = changed
-    return bench
+@pytest.fixture(scope="module", autouse=True)
+def short_signals():
+    """Every kind of signal, in a third of the time."""
+    signals = {name: {**options, "seconds": 0.7, "steps": 2} for name, options in identify_drives._SIGNALS.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identify_drives, "_SIGNALS", signals)
+        yield
 
 
-def identifying(bench, hand, folder, monkeypatch, **options):
-    """Record with a fit that only keeps what it was given."""
-    given = []
-
-    def keep(log, start, **rest):
-        given.append((log, start, rest))
-        raise CalibrationError("enough")
-
-    monkeypatch.setattr(identify_drives, "identify", keep)
-    options = arguments(folder, identify=True, output=folder / "hand.json", joints=("mid_joint1",), **options)
-    with pytest.raises(HandError, match="not identified: mid_joint1"):
-        identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
-    return given[0]
-
-
-def test_an_identification_gets_what_was_sent_and_answered(hand, tmp_path, monkeypatch):
-    sign, offset = np.ones(12), np.zeros(12)
-    sign[6], offset[6] = -1.0, 0.2
-    hardware = dataclasses.replace(arguments(tmp_path).hardware, joint_sign=tuple(sign), joint_offset=tuple(offset))
-    bench, states = BenchHand(hand, []), []
-    bench.position[6] = -0.3
-    bench.hand = dataclasses.replace(hand, joint_lower=np.full(12, -3.0), joint_upper=np.full(12, 3.0))
-
-    def lossy(reply, number):
-        states.append(reply.state["joint"]["position"][6])
-        return None if number % 150 == 0 else reply
-
-    log, start, rest = identifying(wrap(bench, lossy), hand, tmp_path, monkeypatch, hardware=hardware)
-    assert off(bench) and bench.closed
-    sent = np.array([command["position"][6] for command in bench.commands]) * -1.0 + 0.2
-    answered = -np.array(states) + 0.2
-    # The longest stretch of the commands that is the log's: every sample is there, also where no answer came.
-    at = next(i for i in range(len(sent)) if np.allclose(sent[i : i + len(log.target)], log.target, atol=1e-6))
-    expected, lost = answered[at : at + len(log.target)], np.arange(at + 1, at + len(log.target) + 1) % 150 == 0
-    np.testing.assert_allclose(log.position[~lost], expected[~lost], atol=1e-6)
-    assert 0 < lost.sum() < 20 and np.abs(log.position - expected)[lost].max() < 0.05
-    assert log.period == 1 / 83 and np.ptp(log.target) == pytest.approx(0.6, abs=0.01) and log.torque is None
-    assert rest["holdout"] is not None and rest["dead_band"] is None and rest["substeps"] == 2
-    # The inertia is the model's: a finger of 63 g and 56 mm with another link.
-    assert 2e-4 < start["inertia"] < 2e-3 and start["stall_torque"] == pytest.approx(1.1)
-
-
-@pytest.mark.parametrize("angle", [0.8, np.nan])
-def test_an_angle_that_cannot_be_true_is_a_lost_one(hand, tmp_path, monkeypatch, angle):
-    def wrong(reply, number):
-        reply.state["joint"]["position"][6] += angle if number % 150 == 0 else 0.0
-        return reply
-
-    log, _, rest = identifying(wrap(BenchHand(hand, []), wrong), hand, tmp_path, monkeypatch)
-    assert np.abs(np.diff(log.position)).max() < 0.1 and np.abs(np.diff(rest["holdout"].position)).max() < 0.1
-
-
-def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
-    bench, who = wrap(BenchHand(hand, []), lambda reply, number: None if number % 20 == 0 else reply), operator()
-    options = arguments(tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",))
-    with pytest.raises(HandError, match="not identified: mid_joint1"):
-        identify_hand(options, hand, who, port=bench, clock=bench.clock, sleep=bench.sleep)
-    assert "exchanges are missing" in who.console.file.getvalue() and not options.output.exists()
-
-
-def moved(hand, path):
+def moved(hand, path, bench=None, **options):
     """The log of one joint."""
-    bench = BenchHand(hand, [])
-    options = arguments(path.parent, identify=True, joints=("mid_joint1",), log=path)
+    bench = bench or BenchHand(hand, [])
+    options = arguments(path.parent, identify=True, joints=("mid_joint1",), log=path, **options)
     return record(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
 
 
@@ -112,24 +49,73 @@ def rewritten(source, path, change):
     return path
 
 
-def fitted_log(path, hand, calibration=None):
+def fitted_log(path, hand, calibration=None, signal="fit"):
     source, joints = read_joints([path], hand, calibration)
-    return joint_log("mid_joint1", joints["mid_joint1"]["fit"], hand, source, calibration)
+    return joint_log("mid_joint1", joints["mid_joint1"][signal], hand, source, calibration)
 
 
-def test_a_first_exchange_without_an_answer_is_a_lost_one(hand, recorded, tmp_path):
-    whole, seen = fitted_log(recorded, hand), []
+def test_an_identification_gets_what_was_sent_and_answered(hand, tmp_path, monkeypatch):
+    """Every 150th answer is lost, an angle that cannot be true, or NaN: interpolated."""
+    sign, offset = np.ones(12), np.zeros(12)
+    sign[6], offset[6] = -1.0, 0.2
+    hardware = dataclasses.replace(arguments(tmp_path).hardware, joint_sign=tuple(sign), joint_offset=tuple(offset))
+    bench, states, given = BenchHand(hand, []), [], []
+    bench.position[6] = -0.3
+    bench.hand = dataclasses.replace(hand, joint_lower=np.full(12, -3.0), joint_upper=np.full(12, 3.0))
+    exchange = bench.exchange
 
-    def lose(entry):
-        if entry.kind != Kind.TICK or seen:
-            return entry
-        seen.append(entry)
-        return dataclasses.replace(entry, content=entry.content | {"answer": b"", "measured": False})
+    def wrong(command):
+        reply = exchange(command)
+        states.append(reply.state["joint"]["position"][6])
+        if len(states) % 150:
+            return reply
+        reply.state["joint"]["position"][6] += (0.0, 0.8, np.nan)[len(states) // 150 % 3]
+        return reply if len(states) // 150 % 3 else None
 
-    log = fitted_log(rewritten(recorded, tmp_path / "cut.log", lose), hand, ideal_calibration(hand))
+    def keep(log, start, **rest):
+        given.append((log, start, rest))
+        raise CalibrationError("enough")
+
+    bench.exchange = wrong
+    monkeypatch.setattr(identify_drives, "identify", keep)
+    options = arguments(
+        tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",), hardware=hardware
+    )
+    with pytest.raises(HandError, match="not identified: mid_joint1"):
+        identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+    assert off(bench) and bench.closed
+    log, start, rest = given[0]
+    sent = np.array([command["position"][6] for command in bench.commands]) * -1.0 + 0.2
+    answered = -np.array(states) + 0.2
+    # The longest stretch of the commands that is the log's: every sample is there, also where no answer came.
+    at = next(i for i in range(len(sent)) if np.allclose(sent[i : i + len(log.target)], log.target, atol=1e-6))
+    expected, lost = answered[at : at + len(log.target)], np.arange(at + 1, at + len(log.target) + 1) % 150 == 0
+    np.testing.assert_allclose(log.position[~lost], expected[~lost], atol=1e-6)
+    assert 3 <= lost.sum() < 20 and np.abs(log.position - expected)[lost].max() < 0.05
+    assert log.period == 1 / 83 and np.ptp(log.target) == pytest.approx(0.6, abs=0.01) and log.torque is None
+    assert rest["dead_band"] is None and rest["substeps"] == 2 and np.ptp(rest["holdout"].target) < 0.5
+    # The inertia is the model's: a finger of 63 g and 56 mm with another link.
+    assert 2e-4 < start["inertia"] < 2e-3 and start["stall_torque"] == pytest.approx(1.1)
+
+
+def test_a_first_exchange_without_an_answer_is_a_lost_one_and_many_lost_ones_identify_nothing(hand, recorded, tmp_path):
+    def lose(name, which):
+        ticks = iter(range(10_000))
+
+        def change(entry):
+            if entry.kind != Kind.TICK or not which(next(ticks)):
+                return entry
+            return dataclasses.replace(entry, content=entry.content | {"answer": b"", "measured": False})
+
+        return rewritten(recorded, tmp_path / name, change)
+
+    whole = fitted_log(recorded, hand)
+    log = fitted_log(lose("cut.log", lambda number: number == 0), hand, ideal_calibration(hand))
     np.testing.assert_array_equal(log.target, whole.target)
     np.testing.assert_array_equal(log.position[1:], whole.position[1:])
     assert log.position[0] == whole.position[1] and whole.torque is None and len(log.torque) == len(whole.target)
+    with pytest.raises(LogError, match="exchanges are missing"):
+        fitted_log(lose("lossy.log", lambda number: number % 20 == 0), hand)
 
 
 def test_exchanges_that_are_slow_or_missing_identify_nothing_and_a_late_one_does(hand, recorded, tmp_path, monkeypatch):
@@ -183,4 +169,4 @@ def test_a_joint_that_fails_leaves_those_of_the_others(hand, recorded, tmp_path,
     with pytest.raises(HandError, match="not identified: ring_joint1$"):
         identify_hand(options, hand, who)
     assert list(json.loads(output.read_text())["joints"]) == ["mid_joint1"]
-    assert "not identified: ring_joint1: moved over 0.001 rad" in who.console.file.getvalue()
+    assert "not identified: ring_joint1: moved over 0.001 rad" in who.out.getvalue()

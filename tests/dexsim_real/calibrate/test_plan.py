@@ -16,22 +16,16 @@ def test_every_joint_is_pressed_with_and_every_press_goes_outward(hand):
     data = mujoco.MjData(model)
     dofs = [model.joint(name).qposadr[0] for name in hand.joint_names]
     for placement in plan:
-        assert np.abs(placement.direction).max() == 1.0
-
-        def places(advance, placement=placement):
+        tip, taxels = hand.body_names[hand.tip_body[placement.finger]], list(placement.taxels)
+        places = []
+        for advance in (0.0, 0.01):
             data.qpos[dofs] = placement.posture + advance * placement.direction
             mujoco.mj_kinematics(model, data)
-            body = model.body(hand.body_names[hand.tip_body[placement.finger]]).id
-            turn = data.xmat[body].reshape(3, 3)
-            taxels = list(placement.taxels)
-            return (
-                data.xpos[body] + hand.taxel_position[placement.finger, taxels] @ turn.T,
-                hand.taxel_normal[placement.finger, taxels] @ turn.T,
-            )
-
-        (before, normal), (after, _) = places(0.0), places(0.01)
-        moved = np.mean(np.sum((after - before) * normal, -1))
-        assert moved > 0.7 * 0.01 * 0.08, placement.name
+            turn = data.body(tip).xmat.reshape(3, 3).T
+            places.append(data.body(tip).xpos + hand.taxel_position[placement.finger, taxels] @ turn)
+            normal = hand.taxel_normal[placement.finger, taxels] @ turn
+        moved = np.mean(np.sum((places[1] - places[0]) * normal, -1))
+        assert np.abs(placement.direction).max() == 1.0 and moved > 0.7 * 0.01 * 0.08, placement.name
         assert np.all(placement.posture >= hand.joint_lower) and np.all(placement.posture <= hand.joint_upper)
     assert {p.name for p in placements(hand, ("thumb",), sides=False)} == {"thumb pad"}
     with pytest.raises(HandError, match="no finger 'toe'"):

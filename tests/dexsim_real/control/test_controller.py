@@ -29,7 +29,7 @@ from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.sensors.readings import ObjectEstimate
+from dexsim_real.sensors.object_sensors import ObjectEstimate
 from dexsim_real.wire import frames
 
 QUIET = Sensing(

@@ -8,13 +8,12 @@ import pytest
 from test_safety import AGREEING, CYCLE, MIDDLE
 
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.motors_off import PATIENCE
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, LinkCounts, Reply
+from dexsim_real.wire.link import PATIENCE, HandPort, LinkCounts, Reply
 
 
 class Hand(HandPort):
@@ -41,7 +40,7 @@ def loop(hand, monkeypatch):
     """Its cycles are called one by one, in the clock of its hand."""
     port = Hand()
     clock = SimpleNamespace(monotonic=lambda: port.now)
-    monkeypatch.setattr("dexsim_real.control.motors_off.time", clock)
+    monkeypatch.setattr("dexsim_real.wire.link.time", clock)
     monkeypatch.setattr("dexsim_real.loop.ignore_signals", lambda: None)
     safety = Safety(hand, SafetyConfig())
     return LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 1 / CYCLE, clock=clock.monotonic)

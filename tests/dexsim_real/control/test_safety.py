@@ -11,7 +11,7 @@ from dexsim_real.control.pose_check import UNKNOWN
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
-from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.frames import Mode, empty_state
 
 CYCLE = 0.012
 AGREEING = 10  # readings that make a pose
@@ -35,7 +35,7 @@ def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.5, tempe
         errors=np.zeros((12, 3), np.uint16),
         mode=np.full(12, Mode.POSITION, np.uint8),
     )
-    return HandSample(time, 0, generation, measured, np.full(12, velocity, np.float32))
+    return HandSample(time, 0, generation, measured, np.full(12, velocity, np.float32), empty_state())
 
 
 class Bench:

@@ -19,13 +19,13 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.hand.source import recorded_hand
 from dexsim_ppo.policy import load_policy
+from dexsim_real import replay
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import limits_for
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
 from dexsim_real.loop import TARE_SAMPLES
-from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire.frames import Command, Frame

@@ -8,12 +8,11 @@ import time
 import pytest
 
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.motors_off import PATIENCE
 from dexsim_real.control.safety import Safety
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
-from dexsim_real.wire.link import HandPort, LinkCounts, Reply
+from dexsim_real.wire.link import PATIENCE, HandPort, LinkCounts, Reply
 
 pytest.importorskip("serial")
 from following_hand import FollowingHand

@@ -17,11 +17,10 @@ from following_hand import FollowingHand, arguments, summary
 from pty_hand import QUICK
 
 from dexsim import load_hand
-from dexsim_real.control.motors_off import turn_off
 from dexsim_real.core.process import ignore_signals, stopping
 from dexsim_real.run.guard import Guard
 from dexsim_real.wire.frames import empty_state, passive_command
-from dexsim_real.wire.link import Reply
+from dexsim_real.wire.link import HandPort, Reply
 
 
 def runner(peer, folder, *without):
@@ -128,7 +127,7 @@ def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
 def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
     """A procedure has no guard process: an error of the driver must not leave the motors on."""
 
-    class Failing:
+    class Failing(HandPort):
         def __init__(self, answers):
             self.answers = answers
 
@@ -140,9 +139,9 @@ def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
 
     gone, reply = OSError("the adapter is gone"), Reply(empty_state(), 0.0, 0.0, 1, 1)
     port = Failing([gone, None, False, SystemExit(1), reply])
-    assert turn_off(port, passive_command(), 5.0) and port.answers == [reply]
+    assert port.turn_off(passive_command(), 5.0) and port.answers == [reply]
     for answer in (gone, False, True):
-        assert not turn_off(Failing([answer]), passive_command(), 0.05)
+        assert not Failing([answer]).turn_off(passive_command(), 0.05)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])

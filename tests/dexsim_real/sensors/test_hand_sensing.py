@@ -1,13 +1,15 @@
 """From the hand's counts to SI units: signs, scales, tare, and what measures each field."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from dexsim.calibration.maps import Calibration, Side, load_calibration, save_calibration
 from dexsim.observation import GRASP, ROTATE, ROTATE_CRITIC
+from dexsim_real.control.controller import sources_of
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
-from dexsim_real.sensors.readings import sources_of
+from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
@@ -60,28 +62,18 @@ def test_taxels_are_tared_and_scaled(hand):
     assert norm.measure(block).taxel_force[4, 119] == pytest.approx(1.3)
 
 
-def test_current_without_and_with_a_calibration(hand, tmp_path):
+def test_current_without_and_with_a_calibration(hand):
     counts = np.linspace(-900, 900, 12).astype(np.int16)
     plain = HandSensing(hand, HardwareConfig(current_sign=-1.0, current_scale=1500.0))
     np.testing.assert_allclose(plain.measure(state(current=counts)).joint_torque, counts / -1500.0, atol=1e-6)
     np.testing.assert_allclose(plain.measure(state(current=counts)).current, np.abs(counts) / 1000.0, atol=1e-6)
 
-    def side(gain, offset):
-        pair, one = np.ones((2, 12)), np.ones(12)
-        return Side(pair * gain, pair, pair, pair * offset, *[pair] * 5, one, one, one)
-
     # current = -0.05 F - 0.02 A and torque = 0.04 F Nm, so torque = -0.8 (current + 0.02).
-    calibration = Calibration(
-        side(-0.05, -0.02),
-        side(0.04, 0.0),
-        hand.torque_limit,
-        np.full(5, 0.2),
-        hand=hand.name,
-        joint_names=hand.joint_names,
-        finger_names=hand.finger_names,
-    )
-    save_calibration(tmp_path / "hand.toml", calibration)
-    sensing = HandSensing(hand, HardwareConfig(), load_calibration(tmp_path / "hand.toml", hand))
+    calibration, pair = ideal_calibration(hand), np.ones((2, 12))
+    real = dataclasses.replace(calibration.real, gain=-0.05 * pair, offset=-0.02 * pair)
+    sim = dataclasses.replace(calibration.sim, gain=0.04 * pair)
+    calibration = dataclasses.replace(calibration, real=real, sim=sim, force_per_count=np.full(5, 0.2))
+    sensing = HandSensing(hand, HardwareConfig(), calibration)
     block = state(current=counts)
     block["tip"]["taxel"]["z"][0, 0] = 10
     measured = sensing.measure(block)

@@ -32,7 +32,7 @@ def test_each_hand_tells_its_side_and_is_refused_with_the_model_of_the_other(han
         board, contents = Firmware(SimpleNamespace(hand=one)), []
         for register in (SERIAL_NUMBER, SIDE):
             ask = Frame(HOST, palm_address(0), Command.READ_REGISTER, register.to_bytes(2, "little"))
-            contents.append(board.answer(ask, 0.0).data[2:])
+            contents.append(board.answer(ask).data[2:])
         told = read_identity(*contents)
         assert check_identity(told, one) == []
         with pytest.raises(HandError, match=f"this is a {one.side} hand .* the model a {other.side} one: see --hand"):

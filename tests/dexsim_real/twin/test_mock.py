@@ -8,13 +8,13 @@ from calibrating import arguments, operator
 from untrained import untrained
 
 from dexsim import load_hand
+from dexsim_real import replay
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
-from dexsim_real.replay import __main__ as replay
 from dexsim_real.run import __main__ as run
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.mock import MockHand

@@ -61,8 +61,7 @@ def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
     assert report["bridge"]["successes"] == run.policy.goals.successes == 0
     assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
     assert abs(len(controller.seen) * controller.period - 0.5) < 0.15
-    exchanges = run.port.firmware.counts["exchange"]
-    assert exchanges == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
+    assert run.port.counts.answered == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
     assert heard[0] == pytest.approx(0.0096) and np.ptp(np.diff(heard)[40:] - 1 / RATE) < 1e-9
     measured = controller.seen[-1][0]
     # What the policy sees has the wire's steps: 12 bits a turn, 0.1 N, 1 mA.

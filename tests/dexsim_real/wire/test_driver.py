@@ -8,14 +8,12 @@ from untrained import untrained
 
 from dexsim import load_hand
 from dexsim.observation import FIELDS, ObservationConfig, Readings, observe
-from dexsim_real.control.controller import Controller
+from dexsim_real.control.controller import NEEDS, Controller
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.motors_off import turn_off
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.sensors.readings import NEEDS
 from dexsim_real.wire.driver import WITHOUT, DriverPort
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.link import LinkConfig
@@ -113,9 +111,9 @@ def test_motors_count_as_off_only_when_the_hand_says_so(leap):
     port = opened(leap, driver)
     deaf = lambda targets: driver.set(on=np.arange(16) == 3)  # noqa: E731
     driver.send, heard = deaf, driver.send
-    assert not turn_off(port, off(leap), 0.02) and "told to go off" in port.refusal.text
+    assert not port.turn_off(off(leap), 0.02) and "told to go off" in port.refusal.text
     driver.send = heard
-    assert turn_off(port, off(leap), 0.02)
+    assert port.turn_off(off(leap), 0.02)
 
 
 def test_what_a_hand_does_not_measure_is_said_in_a_line_each(leap):

@@ -82,7 +82,6 @@ def test_a_port_that_does_not_open_is_one_line(monkeypatch, error):
     monkeypatch.setattr(serial, "serial_for_url", fail)
     with pytest.raises(HandError, match="^/dev/hand: cannot be opened .*check the name and the cable"):
         SerialHand("/dev/hand", QUICK).connect()
-    monkeypatch.setattr(serial, "Serial", fail)
     with pytest.raises(HandError, match="^/dev/imu: cannot be opened"):
         Imu("/dev/imu")
 

@@ -28,7 +28,7 @@ OURS = Identity("2R32A001", "right")
         (b"2R32A001" + bytes(24), b"right" + bytes(27), OURS),
         (b"2R32A001", b"L\0", Identity("2R32A001", "left")),
         (b"2L32A001", b"\1\0", Identity("2L32A001", "left")),
-        (b"\xff" * 32, None, Identity()),
+        (b"\xff" * 32, b"", Identity()),
     ],
 )
 def test_what_a_hand_tells(serial, side, identity):
@@ -47,7 +47,7 @@ def calibration(hand, serial="2R32A001", handedness="right"):
             ("2R32A001", "right"),
             "this is hand 2R32B002, the calibration is of hand 2R32A001",
         ),
-        (None, ("2R32A001", "right"), "does not tell its serial number, and the calibration is of hand 2R32A001"),
+        (Identity(), ("2R32A001", "right"), "does not tell its serial number, the calibration is of hand 2R32A001"),
         (Identity("2L32A001", "left"), None, "this is a left hand .* the model a right one"),
     ],
 )
@@ -63,7 +63,7 @@ def test_the_hand_of_the_calibration_passes_and_what_is_unknown_is_told(hand):
     (note,) = check_identity(OURS, hand, calibration(hand, "", ""))
     assert "names no serial number" in note
     for known in (None, calibration(hand, "", "")):
-        (note,) = check_identity(None, hand, known)
+        (note,) = check_identity(Identity(), hand, known)
         assert "does not tell its serial number" in note
     assert "code 1" in check_identity(Identity("A001", "code 1"), hand, None)[0]
 

@@ -10,14 +10,13 @@ from twin_pair import command
 from twin_plant import ScriptedPlant
 
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
-from dexsim_real.twin.wire.faults import parse_fault
 from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 
 
-def ask(board, kind, data=b"", now=0.0, target=0x80):
-    return board.answer(Frame(0xFE, target, kind, data), now)
+def ask(board, kind, data=b"", target=0x80):
+    return board.answer(Frame(0xFE, target, kind, data))
 
 
 def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
@@ -70,9 +69,8 @@ def test_the_state_in_the_wires_few_bits():
 def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     plant = ScriptedPlant()
     board = Firmware(plant)
-    for kelvin, hot in ((50.0, False), (65.0, True), (54.0, True), (49.0, False)):  # 85, 100, 89 and 84 degrees
-        board.faults.clear()
-        board.begin(parse_fault(f"0 heat 4 {kelvin} 9"), now=0.0)
+    for degrees, hot in ((85.0, False), (100.0, True), (89.0, True), (84.0, False)):
+        plant.heat[4] = degrees
         state = frames.decode_state(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()

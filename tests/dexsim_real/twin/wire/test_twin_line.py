@@ -72,7 +72,7 @@ def test_a_terminal_keeps_its_name(tmp_path):
     with pytest.raises(OSError):
         os.write(file, b"x")
     os.close(file)
-    terminal.open()
+    terminal = Terminal(tmp_path / "port")
     file = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY)
     os.write(file, b"b")
     assert terminal.read() == b"b" and terminal.read() == b""

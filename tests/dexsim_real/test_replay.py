@@ -11,10 +11,9 @@ from following_hand import FollowingHand, arguments, records, summary
 
 from dexsim.core import cli
 from dexsim.core.errors import DexsimError
+from dexsim_real import replay
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
-from dexsim_real.replay import __main__ as replay_command
-from dexsim_real.replay import replay
 from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
@@ -58,8 +57,8 @@ def shown_in_rerun(hand, folder, ticks):
     """The signals and the whole observation."""
     sent = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay_command, "show_rerun", lambda *parts: sent.append(parts))
-        assert replay_command.main([str(folder / "run.log"), "--rrd", str(folder / "run.rrd")]) == 0
+        patch.setattr(replay, "show_rerun", lambda *parts: sent.append(parts))
+        assert replay.main([str(folder / "run.log"), "--rrd", str(folder / "run.rrd")]) == 0
     ((_, times, series, taxels, path),) = sent
     assert path == folder / "run.rrd" and len(times) == len(ticks) == len(taxels)
     np.testing.assert_array_equal(series["angle"][1], [tick["readings"]["joint_position"] for tick in ticks])
@@ -73,9 +72,9 @@ def taken_along(folder, ticks):
     """As a dataset: what each tick read, and the target that followed."""
     sent = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay_command, "check_lerobot", lambda path: None)
-        patch.setattr(replay_command, "write_lerobot", lambda *parts: sent.append(parts))
-        assert replay_command.main([str(folder / "run.log"), "--lerobot", str(folder / "data")]) == 0
+        patch.setattr(replay, "check_lerobot", lambda path: None)
+        patch.setattr(replay, "write_lerobot", lambda *parts: sent.append(parts))
+        assert replay.main([str(folder / "run.log"), "--lerobot", str(folder / "data")]) == 0
     ((path, _, task, (data,)),) = sent
     assert path == folder / "data" and task == "grasp"
     for name in ("joint_position", "taxel_force", "object_quat", "command"):
@@ -89,7 +88,7 @@ def drawn_by_finger(hand, folder, ticks):
     drawn = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("matplotlib.pyplot.close", drawn.append)
-        assert replay_command.main([str(folder / "run.log"), "--plot", str(folder / "run.png")]) == 0
+        assert replay.main([str(folder / "run.log"), "--plot", str(folder / "run.png")]) == 0
     assert (folder / "run.png").stat().st_size > 10_000
     axes = drawn[0].axes[:5]
     assert [axis.get_ylabel() for axis in axes] == [f"{name} [rad]" for name in hand.finger_names]
@@ -127,7 +126,7 @@ def forged(folder):
     path = rewritten(folder, flip)
     report = replay.replay(path).report
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
-    assert replay_command.main([str(path)]) == 1
+    assert replay.main([str(path)]) == 1
     for of, name, value in (
         (Kind.TICK, "readings", 1.0),
         (Kind.TICK, "sequence", [1]),
@@ -147,7 +146,7 @@ def without_frames(folder):
         path = rewritten(folder, lambda kind, content: None if kind in lost else content)  # noqa: B023
         out = io.StringIO()
         with contextlib.redirect_stdout(out):
-            assert replay_command.main([str(path)]) == 1
+            assert replay.main([str(path)]) == 1
         line = out.getvalue().splitlines()[-1]
         assert line.startswith(f"nothing could be compared{says}"), line
 
@@ -158,24 +157,24 @@ def test_a_log_of_another_command_is_named_with_the_command_that_reads_it(tmp_pa
     with LogWriter(path) as log:
         log.add(Kind.META, {"task": task, "policy": "", "calibration": "", "hardware": {}, "environment": {}})
     with pytest.raises(LogError, match="not a log of a run; `python -m dexsim_real.calibrate ") as error:
-        replay_command.main([str(path)])
+        replay.main([str(path)])
     words = str(error.value).split("`")[1].split()
     given = cli.parse(CalibrateArguments, words[3:], prog="", description="")
     assert given.from_log == (path,) and given.identify == (task == "identify")
 
 
 def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay_command, "replay", lambda *_: pytest.fail("the replay began"))
+    monkeypatch.setattr(replay, "replay", lambda *_: pytest.fail("the replay began"))
     log = str(tmp_path / "run.log")
     with pytest.raises(DexsimError, match="--plot run.log2: give a file that ends in .png, .pdf or .svg"):
-        replay_command.main([log, "--plot", "run.log2"])
+        replay.main([log, "--plot", "run.log2"])
     (tmp_path / "taken.png").mkdir()
     for option in ("--plot", "--rrd", "--output"):
         with pytest.raises(IsADirectoryError, match="taken.png"):
-            replay_command.main([log, option, str(tmp_path / "taken.png")])
+            replay.main([log, option, str(tmp_path / "taken.png")])
     (tmp_path / "run.log").touch()
     with pytest.raises(DexsimError, match="--output .*run.log: is the log; name another file"):
-        replay_command.main([log, "--output", log])
+        replay.main([log, "--output", log])
     pytest.importorskip("pyarrow")
     with pytest.raises(DexsimError, match="taken.png: exists already"):
-        replay_command.main([log, "--lerobot", str(tmp_path / "taken.png")])
+        replay.main([log, "--lerobot", str(tmp_path / "taken.png")])

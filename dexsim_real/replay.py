@@ -1,0 +1,258 @@
+"""Recomputes the log of a run, checks every observation against the recorded frames, and writes what is asked for.
+
+    python -m dexsim_real.replay runs/real/....log --plot run.png
+
+Joint angles, torques and taxel forces are recomputed from the frame that each tick used, and the observation from the
+readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit, and those whose
+frame is missing: they are not recomputed.
+"""
+
+import dataclasses
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from dexsim import load_hand
+from dexsim.calibration.maps import calibrated_hand, load_calibration
+from dexsim.core import cli
+from dexsim.core.config import from_dict
+from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+from dexsim.datasets.rerun import show_rerun
+from dexsim.datasets.trajectory import from_readings
+from dexsim.hand.source import recorded_hand
+from dexsim.observation import Readings, layout
+from dexsim.task_spec import TaskSpec
+from dexsim_real.control.alarms import finger_joints
+from dexsim_real.control.controller import make_observe, prepare_jax
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
+from dexsim_real.wire import frames
+
+_KEPT = 50  # newest frames, of which a tick used one
+_OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
+"""Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
+
+
+class Replay:
+    """A log that is recomputed record by record; `meta` is the configuration of the run."""
+
+    def __init__(self, path: Path, meta: dict[str, Any], hand: str):
+        if options := _OTHERS.get(str(meta.get("task"))):
+            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate {options} {path}` reads it")
+        self.hand = recorded_hand(meta.get("hand"), hand, "the log") or load_hand()
+        calibration = None
+        if meta["calibration"]:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "calibration.toml"
+                file.write_text(meta["calibration"])
+                calibration = load_calibration(file, self.hand)
+        self._sensing = HandSensing(self.hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
+        spec = from_dict(TaskSpec, meta["spec"])
+        self.fields = layout(self.hand, spec.fields, spec.observation)
+        self._observe = make_observe(calibrated_hand(self.hand, calibration), spec.fields, spec.observation)
+        self.report: dict[str, Any] = {"log": str(path)} | {name: meta[name] for name in ("task", "policy")}
+        self.report |= dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
+        self.report |= {"first_difference": None, "ended": "truncated", "recorded_on": meta["environment"]}
+        self.ticks, self.measured = list[dict[str, Any]](), list[HandMeasurement]()  # as logged; recomputed
+        self._times, self._observations = list[float](), list[np.ndarray]()
+        self._states: dict[int, bytes] = {}
+        self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s since the first tick."""
+        return np.array(self._times) - (self._times[0] if self._times else 0.0)
+
+    @property
+    def observation(self) -> np.ndarray:
+        """[T, n] recomputed."""
+        return np.array(self._observations)
+
+    def add(self, record: Record) -> None:
+        """Take in the next record."""
+        content, report = record.content, self.report
+        if record.kind == Kind.META:
+            self._tares.append((content["from"], content["tare"]))
+        elif record.kind == Kind.RECEIVED:
+            number, frame = content
+            report["frames"] += 1
+            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
+                self._states[number] = frame
+                self._states.pop(number - _KEPT, None)
+        elif record.kind == Kind.TICK:
+            frame = self._states.get(content["sequence"])
+            report["without_frame"] += frame is None
+            if frame is not None:
+                self._compare(record.time, content, frame)
+        elif record.kind == Kind.END:
+            report["ended"] = content["end"]
+
+    def _compare(self, time: float, tick: dict[str, Any], frame: bytes) -> None:
+        # The exchange thread may have changed the tare before the tick's record was written.
+        self._sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
+        measured = self._sensing.measure(self._sensing.decode(frame[frames.HEADER.size : -2]))
+        # The hand's measurements are recomputed; camera, goal and command are taken from the log.
+        again = {name: getattr(measured, name) for name in ("joint_position", "joint_torque", "taxel_force")}
+        same = all(_same(value, tick["readings"][name]) for name, value in again.items())
+        observation = np.asarray(self._observe(Readings(**{**tick["readings"], **again})))
+        identical = _same(observation, tick["observation"])
+        self.report["readings_same"] += same
+        self.report["observations_same"] += identical
+        if not (same and identical) and self.report["first_difference"] is None:
+            self.report["first_difference"] = f"tick {len(self.ticks)} at {time:.3f} s"
+        self._times.append(time)
+        self.measured.append(measured)
+        self.ticks.append(tick)
+        self._observations.append(observation)
+
+
+def replay(path: Path, hand: str = "") -> Replay:
+    """Recompute a log; `hand` is the TOML of the hand, where it is not in the place that the log names.
+
+    Raises:
+      ConfigError: the log is of another hand.
+      LogError: not a log, or one of another command, or the log ends before the hand was ready.
+    """
+    reader, run, notes = LogReader(path), None, list[str]()
+    with reading(path):
+        for record in reader:
+            if record.kind == Kind.META and "from" not in record.content:
+                run = Replay(path, record.content, hand)
+            elif record.kind == Kind.NOTE:
+                notes.append(f"{record.time:.3f} {record.content}")
+            elif run is not None:
+                run.add(record)
+    if run is None:
+        raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
+    time = run.time
+    run.report |= {"ticks": len(time), "seconds": float(time[-1]) if len(time) else 0.0}
+    run.report |= {"damaged_bytes": reader.damaged, "notes": notes}
+    return run
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays agree to the last bit."""
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+# --- the command ------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReplayArguments:
+    """Options of `python -m dexsim_real.replay`."""
+
+    log: Annotated[Path, tyro.conf.Positional]
+    """Log file of `python -m dexsim_real.run`."""
+    plot: Path | None = None
+    """Image file for a figure of angles, forces and timing (.png, .pdf or .svg); None draws no figure."""
+    rrd: Path | None = None
+    """Recording for the rerun viewer (extra `rerun`); None writes no file."""
+    lerobot: Path | None = None
+    """Folder for a dataset of one episode in the LeRobot format (extra `lerobot`), which must not exist yet; None
+    writes none."""
+    hand: str = ""
+    """The TOML of a hand of your own, where it is not in the place that the log names."""
+    output: Path | None = None
+    """JSON file for the report; None writes no file."""
+
+    def __post_init__(self):
+        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
+    arguments = cli.parse(
+        ReplayArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.replay",
+        description="Recompute and plot the log of a run on the hand.",
+    )
+    outputs = {"--plot": arguments.plot, "--rrd": arguments.rrd, "--output": arguments.output}
+    cli.check_no_overwrite(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
+    for path in filter(None, outputs.values()):
+        cli.check_writable(path)
+    if arguments.lerobot:
+        check_lerobot(arguments.lerobot)
+    prepare_jax()
+    cli.enable_caches()
+    run = replay(arguments.log, arguments.hand)
+    report, ticks = run.report, len(run.ticks)
+    print(*report["notes"], sep="\n")
+    print(
+        f"{ticks} ticks in {report['seconds']:.2f} s, {report['frames']} frames, {report['damaged_bytes']} damaged "
+        f"bytes, end: {report['ended']}"
+    )
+    verdict = "all observations agree to the last bit" if ticks else "nothing could be compared"
+    if first := report["first_difference"]:
+        verdict = f"{report['observations_same']} of {ticks} observations agree; first difference: {first}"
+    if missing := report["without_frame"]:
+        verdict += f"; {missing} ticks lack their frame"
+    print(verdict)
+    if arguments.output:
+        cli.write_json(arguments.output, report)
+    if ticks and arguments.plot:
+        plot(run, arguments.plot)
+    if ticks and arguments.rrd:
+        write_rerun(run, arguments.rrd)
+    if ticks and arguments.lerobot:
+        targets = np.array([tick["target"] for tick in run.ticks])
+        episode = from_readings(run.time, [tick["readings"] for tick in run.ticks], targets)
+        write_lerobot(arguments.lerobot, run.hand, report["task"], [episode])
+    return 0 if report["readings_same"] == report["observations_same"] == ticks > 0 else 1
+
+
+def signals(run: Replay) -> dict[str, np.ndarray]:
+    """Plotted signals, [T, n] each: joint angles and targets (rad), forces (N), command (1), measurement ages (s)."""
+    return {
+        "angle": np.array([now.joint_position for now in run.measured]),
+        "target": np.array([tick["target"] for tick in run.ticks]),
+        "force": np.array([now.finger_force for now in run.measured]),
+        "command": np.array([[float(tick["readings"]["command"])] for tick in run.ticks]),
+        "age": np.array([[tick["age"]] for tick in run.ticks]),
+    }
+
+
+def plot(run: Replay, path: Path) -> None:
+    """Write a figure: an axis for each finger with its joint angles and targets, then forces, command and age."""
+    import matplotlib.pyplot as plt
+
+    hand, values = run.hand, signals(run)
+    figure, axes = plt.subplots(hand.num_fingers + 3, 1, figsize=(10, 16), sharex=True, constrained_layout=True)
+    for finger, (axis, name) in enumerate(zip(axes, hand.finger_names, strict=False)):
+        for joint in finger_joints(hand, finger):
+            (line,) = axis.plot(run.time, values["angle"][:, joint], lw=1, label=hand.joint_names[joint])
+            axis.plot(run.time, values["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
+        axis.set_ylabel(f"{name} [rad]")
+    axes[0].set_title("joint angles; targets dotted", loc="left")
+    others = {"force": hand.finger_names, "command": ["command"], "age": ["measurement"]}
+    for axis, (signal, names), unit in zip(axes[hand.num_fingers :], others.items(), ("N", "0 to 1", "s"), strict=True):
+        axis.plot(run.time, values[signal], lw=0.8, label=names)
+        axis.set_ylabel(f"{signal} [{unit}]")
+    for axis in axes:
+        axis.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
+    axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def write_rerun(run: Replay, path: Path) -> None:
+    """Write a recording for the rerun viewer: the signals, the observation by fields, and taxels as pictures."""
+    hand = run.hand
+    names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
+    series = {name: (names.get(name, (name,)), values) for name, values in signals(run).items()}
+    edges = np.cumsum([field.size for field in run.fields])[:-1]
+    for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True):
+        series[f"observation/{field.name}"] = tuple(f"{field.name} {i}" for i in range(field.size)), values
+    show_rerun(hand, run.time, series, np.stack([now.taxel_force for now in run.measured]), path)
+
+
+if __name__ == "__main__":
+    cli.run(main)
