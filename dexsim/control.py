@@ -47,13 +47,14 @@ def closing(hand: Hand) -> np.ndarray:
     """Signs [F] of the root joints' rotation that closes the fingers: it moves a fingertip where its skin faces."""
     rest = np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper)
 
-    def tips(posture: jax.Array) -> jax.Array:
-        return forward_kinematics(hand, posture).tip_position
+    @jax.jit
+    def directions(posture: jax.Array) -> tuple[jax.Array, jax.Array]:
+        moves = jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position)(posture)
+        return moves, taxel_normals(hand, forward_kinematics(hand, posture))
 
     with jax.ensure_compile_time_eval():
-        posture = jnp.asarray(hand.grasp_posture or rest, jnp.float32)
-        moves = np.asarray(jax.jacfwd(tips)(posture))[np.arange(hand.num_fingers), :, hand.root_joint]
-        faces = np.asarray(taxel_normals(hand, forward_kinematics(hand, posture))).mean(1)
+        moves, normals = map(np.asarray, directions(jnp.asarray(hand.grasp_posture or rest, jnp.float32)))
+    moves, faces = moves[np.arange(hand.num_fingers), :, hand.root_joint], normals.mean(1)
     return np.where(np.sum(moves * faces, -1) < 0, -1.0, 1.0).astype(np.float32)
 
 

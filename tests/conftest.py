@@ -6,6 +6,7 @@ Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests t
 
 import contextlib
 import functools
+import gc
 import os
 import signal
 import subprocess
@@ -23,13 +24,16 @@ _cache = Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_cache / "xla")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # Programs that do not name our lines are made faster.
 os.environ.setdefault("MPLBACKEND", "agg")
 # Compilation is most of what the suite does, and takes a third of the time without optimisation and by the older
 # emitters. The other core has the suite's other process: to split a program for several threads only costs.
 XLA_FLAGS = (
     "--xla_backend_optimization_level=0",
     "--xla_cpu_use_fusion_emitters=false",
+    "--xla_llvm_disable_expensive_passes=true",
     "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_force_host_platform_device_count=2",  # for the learner on two devices; all else uses the first
 )
 
 
@@ -45,6 +49,8 @@ def is_known(*flags: str) -> bool:
 
 if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ |= with_flags(*(XLA_FLAGS if is_known(*XLA_FLAGS) else filter(is_known, XLA_FLAGS)))
+
+gc.set_threshold(200_000, 20, 20)  # Tracing makes millions of objects, hardly any of them in circles.
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
@@ -64,10 +70,10 @@ hypothesis.settings.load_profile("dexsim")
 
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
 LONGEST = """
-test_hand_tasks test_press_fit test_shipped_policy test_identification test_docs test_calibrate_command
-test_bridge_run test_procedure test_calibration test_identify_drives test_rotate test_motors_off test_view
-test_shipped_policies test_env test_engines test_randomization test_env_options test_drives test_learning
-test_train test_check_hand test_sharding test_twin_virtual
+test_hand_tasks test_shipped_policy test_identification test_docs test_engines test_check_hand test_press_fit
+test_procedure test_import_hand test_identify_drives test_env test_shipped_policies test_gymnasium test_learning
+test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_env_options test_train
+test_force_hold test_c_backend test_randomization
 """.split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8

@@ -15,6 +15,7 @@ from dexsim import registry
 from dexsim.__main__ import COMMANDS
 from dexsim.core import cli
 from dexsim.core.config import from_dict, override
+from dexsim.geometry import grid
 from dexsim_ppo import load_policy
 
 if not (ROOT / "docs").exists():
@@ -55,6 +56,7 @@ def commands(page: Path, start: str):
 def test_snippet_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.setitem(grid.bake.__kwdefaults__, "nodes", 24)  # 64 take twenty times as long to measure
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
 
 

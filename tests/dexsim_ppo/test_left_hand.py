@@ -57,6 +57,7 @@ def mirror_start(start):
     return dataclasses.replace(start, qpos=qpos, object=mirrored)
 
 
+@pytest.mark.slow
 def test_both_hands_do_the_same_in_the_mirror(hand, left):
     """A closed loop of a shipped policy in C MuJoCo, with contacts: nominal hands, no pushes, no noise of sensors."""
     policy = load_policy("grasp")

@@ -1,6 +1,7 @@
 """Parts of an environment's state, for tests that put others in."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -18,6 +19,14 @@ def with_episode(state, **parts):
     return dataclasses.replace(state, episode=dataclasses.replace(state.episode, **parts))
 
 
+def ones_of(env, count, *given):
+    """A batch of states with ones everywhere, of the shapes that `env.reset(key, *given)` gives, and keys."""
+    keys = jax.random.split(jax.random.key(0), count)
+    shapes = jax.eval_shape(jax.vmap(env.reset), keys, *given)
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return jax.tree.map(lambda x: keys if is_key(x) else jnp.ones(x.shape, x.dtype), shapes)
+
+
 def ground_truth(env, object, physics, force):
     """What a task would see of this object and physics state, under forces [F, 3] N on the finger tips."""
     zero = jnp.zeros(env.hand.num_joints)
@@ -25,9 +34,16 @@ def ground_truth(env, object, physics, force):
     return env._ground_truth(episode, StepResult(physics, force), (zero, zero > 0), zero, zero)
 
 
+@functools.cache
+def _middle(hand):
+    """The middle posture and the hand in it."""
+    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
+    return joints, jax.jit(forward_kinematics, static_argnums=0)(hand, joints)
+
+
 def still_moment(hand, position, **changes):
     """A `GroundTruth` at rest: the middle posture, an object at `position` that nothing touches; with these changes."""
-    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
+    joints, pose = _middle(hand)
     zero, fingers, nothing = jnp.zeros(hand.num_joints), jnp.zeros(hand.num_fingers), jnp.zeros(hand.taxel_area.shape)
     moment = GroundTruth(
         object=None,
@@ -35,7 +51,7 @@ def still_moment(hand, position, **changes):
         joint_velocity=zero,
         joint_torque=zero,
         torque_limited=zero > 0,
-        pose=forward_kinematics(hand, joints),
+        pose=pose,
         finger_force=jnp.zeros((hand.num_fingers, 3)),
         normal_force=fingers,
         touch=Touch(nothing, nothing, nothing),

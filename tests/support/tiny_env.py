@@ -82,7 +82,6 @@ class TinyEnv:
 
     def __init__(self, config: TinyConfig | None = None, *, backend: str = "mjx"):
         self.config, self.backend = config or TinyConfig(), "mjx" if backend == "auto" else backend
-        self.traces = 0
 
     def _start(self, key: jax.Array) -> TinyState:
         key, subkey = jax.random.split(key)
@@ -103,7 +102,6 @@ class TinyEnv:
         return dataclasses.replace(state, metrics=state.metrics | {"length": clock})
 
     def step(self, state: TinyState, action: jax.Array) -> TinyState:
-        self.traces += 1
         x = state.x + self.config.gain * jnp.clip(action[0], -1.0, 1.0)
         error = jnp.abs(x - state.target)
         length = state.metrics["length"] + 1

@@ -1,5 +1,6 @@
 """The training command with the tiny task among its tasks; arguments as on the command line."""
 
+import functools
 import types
 
 import pytest
@@ -7,6 +8,7 @@ from tiny_env import TinyConfig, TinyEnv
 
 import dexsim
 from dexsim import registry
+from dexsim_ppo.training import trainer
 
 ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, task=TinyEnv, environment=None)
 
@@ -15,16 +17,24 @@ QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16".
 PER_ITERATION = 16 * 8  # steps of QUICK
 
 
-def make(task, config=None, *, backend="auto", **_):
+# Runs with the same settings share their environment and its compiled programs.
+make_env = functools.cache(lambda env_class, config, backend: env_class(config, backend=backend))
+make_train, make_evaluator = functools.cache(trainer.make_train), functools.cache(trainer.Evaluator)
+
+
+def make(env_class, task, config=None, *, backend="auto", **_):
     assert task == "tiny"
-    return TinyEnv(config, backend=backend)
+    return make_env(env_class, config or TinyConfig(), backend)
 
 
-def install(patch):
+def install(patch, env_class=TinyEnv):
     """Put the task among the tasks for as long as a `pytest.MonkeyPatch` lasts."""
+    tiny = functools.partial(make, env_class)
     patch.setitem(registry.TASKS, "tiny", ENTRY)
-    patch.setattr(registry, "make", make)
-    patch.setattr(dexsim, "make", make, raising=False)
+    patch.setattr(trainer, "make_train", make_train)
+    patch.setattr(trainer, "Evaluator", make_evaluator)
+    patch.setattr(registry, "make", tiny)
+    patch.setattr(dexsim, "make", tiny, raising=False)
 
 
 def finished_run(path, *arguments):
@@ -43,5 +53,5 @@ if __name__ == "__main__":
     from dexsim_ppo import train
 
     registry.TASKS["tiny"] = ENTRY
-    registry.make = dexsim.make = make
+    registry.make = dexsim.make = functools.partial(make, TinyEnv)
     cli.run(train.main)

@@ -1,12 +1,12 @@
-"""What an environment does beyond its defaults: imperfect taxels, and a scale of the ranges."""
+"""What an environment does beyond its defaults: imperfect taxels, a scale of the ranges, objects held at first."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import ones_of
 from simple_physics import SimplePhysics
 from swapped import drawn, rollout
 
@@ -30,60 +30,72 @@ POOR_TAXELS = TaxelSensor(
 
 @pytest.fixture(scope="module")
 def env():
-    """Over simple physics, with imperfect taxels."""
+    """Over simple physics, with imperfect taxels; objects are let go after 0.1 s."""
     taxels = dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)
-    config = GraspConfig(sensing=Sensing(taxel=taxels), pool_size=4, objects=ObjectConfig(shapes=("sphere",)))
+    config = GraspConfig(
+        sensing=Sensing(taxel=taxels),
+        pool_size=4,
+        objects=ObjectConfig(shapes=("sphere",)),
+        release_delay=(0.1, 0.1),
+        push_probability=0.0,
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dexsim.env.env.Physics", SimplePhysics)
         return dexsim.make("grasp", config, backend="c")
 
 
-class TestScale:
-    """A width of the ranges that is part of the state: 0 is nominal exactly, for hand, sensors and object."""
-
-    def test_zero_is_nominal(self, env, hand):
-        objects = env.config.objects
-        rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.arange(64) % 4], env.pool.object)
-        draw = jit(jax.vmap(lambda *given: env.sampler.sample(*given, jnp.float32(0))), once=True)
-        state = SimpleNamespace(episode=draw(*jax.random.split(jax.random.key(0), (3, 64)), rows))
-        for value, nominal in (
-            (state.episode.hand.actuator.stall_torque, hand.torque_limit),
-            (state.episode.hand.encoder_bias, 0),
-            (state.episode.hand.tilt, 0),
-            (state.episode.imu.bias, 0),
-            (state.episode.taxels["gain"], 1),
-            (state.episode.taxels["bias"], 0),
-            (state.episode.taxels["crosstalk"], 0),
-            (state.episode.taxels["alive"], True),
-            (state.episode.object.mass, np.mean(objects.mass)),
-            (state.episode.object.friction, np.mean(objects.friction)),
-            (state.episode.object.com, 0),
-            (state.episode.object.contact[:, 0], np.mean(objects.stiffness)),
-        ):
-            np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
-        assert len(np.unique(state.episode.object.contact[:, 1])) == 1
-        radius = np.asarray(state.episode.object.size[:, 1, 0])
-        assert len(np.unique(radius)) > 1  # sizes stay as the pool has them
-        ball = np.mean(objects.mass) * 0.4 * radius**2
-        # A sphere is a capsule with a straight part of 0.2 mm.
-        np.testing.assert_allclose(state.episode.object.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
-
-    def test_restarts_draw_at_the_states_scale(self, env):
-        """Here of a state with ones everywhere: only what is done is drawn, and at the state's scale."""
-        shapes = jax.eval_shape(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8), jnp.ones(8)), KEY)
-        ones = lambda x: jnp.ones(x.shape, x.dtype)  # noqa: E731
-        is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
-        state = jax.tree.map(lambda x: jax.random.split(KEY, x.shape) if is_key(x) else ones(x), shapes)
-        state = jax.vmap(env.set_randomization_scale)(state, jnp.zeros(8))
-        begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(8) < 4)
-        np.testing.assert_array_equal(begun.episode.hand.encoder_bias[:, 0], np.arange(8) >= 4)
-        np.testing.assert_array_equal(begun.scale, 0.0)
-        np.testing.assert_array_equal(begun.episode.object.mass[:4], np.float32(np.mean(env.config.objects.mass)))
+def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(env, hand):
+    """Of a state with ones everywhere only what is done is drawn; sizes stay as the pool has them."""
+    state = jax.vmap(env.set_randomization_scale)(ones_of(env, 16, jnp.ones(16)), jnp.zeros(16))
+    begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(16) < 12)
+    np.testing.assert_array_equal(begun.episode.hand.encoder_bias[:, 0], np.arange(16) >= 12)
+    np.testing.assert_array_equal(begun.scale, 0.0)
+    episode, objects = jax.tree.map(lambda leaf: leaf[:12], begun.episode), env.config.objects
+    for value, nominal in (
+        (episode.hand.actuator.stall_torque, hand.torque_limit),
+        (episode.hand.encoder_bias, 0),
+        (episode.hand.tilt, 0),
+        (episode.imu.bias, 0),
+        (episode.taxels["gain"], 1),
+        (episode.taxels["bias"], 0),
+        (episode.taxels["crosstalk"], 0),
+        (episode.taxels["alive"], True),
+        (episode.object.mass, np.mean(objects.mass)),
+        (episode.object.friction, np.mean(objects.friction)),
+        (episode.object.com, 0),
+        (episode.object.contact[:, 0], np.mean(objects.stiffness)),
+    ):
+        np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
+    assert len(np.unique(episode.object.contact[:, 1])) == 1
+    radius = np.asarray(episode.object.size[:, 1, 0])
+    assert len(np.unique(radius)) > 1
+    ball = np.mean(objects.mass) * 0.4 * radius**2
+    # A sphere is a capsule with a straight part of 0.2 mm.
+    np.testing.assert_allclose(episode.object.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
 
 
-def test_every_error_of_taxels_reaches_their_readings_and_nothing_else(env):
+@pytest.fixture(scope="module")
+def begun(env):
+    """Eight episodes, and the compiled step."""
     states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(KEY)
-    shows = rollout(jit(jax.vmap(env.step), once=True), states, ticks=10)
+    return states, jit(jax.vmap(env.step), once=True)
+
+
+def test_an_object_is_held_until_it_is_let_go(env, begun):
+    """For 0.1 s, four ticks; then it falls freely."""
+    (state, step), heights = begun, []
+    for _ in range(7):
+        state = step(state, jnp.zeros((8, 12)))
+        heights.append(np.asarray(state.physics.qpos[:, 12]))
+    np.testing.assert_array_equal(heights[:4], [heights[0]] * 4)
+    steps = env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
+    fall = 0.5 * 9.81 * steps * (steps + 1) * env.config.physics.timestep**2
+    np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], 8), rtol=0.02)
+
+
+def test_every_error_of_taxels_reaches_their_readings_and_nothing_else(begun):
+    states, step = begun
+    shows = rollout(step, states, ticks=10)
     found = {path.removeprefix("taxels.") for path in drawn(states.episode) if path.startswith("taxels.")}
     assert found == set("hysteresis memory crosstalk gain bias drift alive rate phase".split())
     for name in found - {"phase"}:  # which shows late

@@ -1,6 +1,7 @@
 """From what sensors see to what the host reads: latency, biases, steps and filters in closed form, without physics."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -24,28 +25,37 @@ GOAL = jnp.float32(0.25), jnp.array([0.6, 0.8, 0.0, 0.0])
 AGE = 0.25  # of a tick
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def read(hand):
-    """`read(sensing, now, last)` gives the readings of an episode whose hand has an error of every kind."""
+    """`read(sensing, now, last)` gives the readings of an episode whose hand has an error of every kind; `last` are
+    the readings before, and what sensors saw then."""
 
-    def run(sensing, now, last=None, key=0, age=AGE, bias=(0.0, 0.0, 0.0)):
+    @functools.cache
+    def suite_of(sensing):
         config = GraspConfig(sensing=sensing)
-        suite = SensorSuite(config, hand, Grasp(config, hand))
+        return SensorSuite(config, hand, Grasp(config, hand))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def run(suite, now, last, key, age, bias):
         zero = jnp.zeros(())
         errors = SimpleNamespace(
-            sensing_latency=jnp.float32(age),
+            sensing_latency=age,
             encoder_bias=jnp.linspace(-0.01, 0.01, 12),
             torque_gain=jnp.full(12, 1.5),
             taxel_gain=jnp.ones(hand.taxel_area.shape),
             tilt=jnp.array([0.1, 0.0]),
         )
         imu = ImuParams(**{f.name: zero for f in dataclasses.fields(ImuParams)})
-        imu = dataclasses.replace(imu, bias=jnp.asarray(bias))
+        imu = dataclasses.replace(imu, bias=bias)
         episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.taxels.sample(jax.random.key(0), 0.0))
-        then = now if last is None else last.then
-        return suite.read(jax.random.key(key), episode, now, then, GOAL, jnp.full(12, 0.5), last)[0]
+        readings, then = last or (None, now)
+        before = SimpleNamespace(readings=readings, length=jnp.int32(3), taxel_memory=suite.taxels.init())
+        return suite.read(jax.random.key(key), episode, now, then, GOAL, jnp.full(12, 0.5), last and before)[0]
 
-    return run
+    def plain(sensing, now, last=None, key=0, age=AGE, bias=(0.0, 0.0, 0.0)):
+        return run(suite_of(sensing), now, last, key, jnp.float32(age), jnp.asarray(bias))
+
+    return plain
 
 
 def seen(hand, joint, torque, place):
@@ -58,20 +68,11 @@ def seen(hand, joint, torque, place):
     )
 
 
-def before(hand, readings, then):
-    return SimpleNamespace(
-        then=then,
-        readings=readings,
-        length=jnp.int32(3),
-        taxel_memory=SensorSuite(GraspConfig(), hand, Grasp(GraspConfig(), hand)).taxels.init(),
-    )
-
-
 def test_readings_are_a_quarter_tick_old_and_have_the_hands_own_errors(hand, read):
     then, now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1)), seen(hand, 0.6, 0.3, (0.09, 0.01, 0.2))
     first = read(QUIET, then)
     np.testing.assert_allclose(first.joint_position, 0.2 + np.linspace(-0.01, 0.01, 12), rtol=1e-5)
-    found = read(QUIET, now, before(hand, first, then))
+    found = read(QUIET, now, (first, then))
     np.testing.assert_allclose(found.joint_position, 0.5 + np.linspace(-0.01, 0.01, 12), rtol=1e-5)
     np.testing.assert_allclose(found.joint_torque, 1.5 * 0.25, rtol=1e-5)
     assert float(found.command) == 0.25 and np.all(np.asarray(found.last_action) == 0.5)
@@ -83,7 +84,7 @@ def test_only_the_measured_coordinates_move_and_their_velocity_is_filtered(hand,
     sensing = dataclasses.replace(QUIET, object_axes=(True, False, True), velocity_filter=0.3)
     period, reference = GraspConfig().physics.control_period, hand.grasp_centre
     heights, velocity = (0.05, 0.06, 0.09), 0.0
-    last = then = None
+    last = None
     for k, height in enumerate(heights):
         now = seen(hand, 0.0, 0.0, (height, 0.5, 2 * height))
         found = read(sensing, now, last, age=0.0)
@@ -91,8 +92,7 @@ def test_only_the_measured_coordinates_move_and_their_velocity_is_filtered(hand,
         if k:
             velocity += 0.3 * ((height - heights[k - 1]) / period - velocity)
         np.testing.assert_allclose(found.object_velocity, [velocity, 0.0, 2 * velocity], rtol=1e-4, atol=1e-6)
-        then = now
-        last = before(hand, found, then)
+        last = found, now
 
 
 def test_angles_come_in_steps_and_each_reading_has_its_own_noise(hand, read):
@@ -119,7 +119,7 @@ def test_past_actions_are_the_two_before_the_last(hand, read):
     for _ in range(4):
         reading = read(QUIET, now, last)
         shown.append(np.asarray(reading.past_actions)[:, 0])
-        last = before(hand, dataclasses.replace(reading, last_action=jnp.full(12, len(shown) / 10)), now)
+        last = dataclasses.replace(reading, last_action=jnp.full(12, len(shown) / 10)), now
     np.testing.assert_allclose(shown, [[0.5, 0.5], [0.1, 0.5], [0.2, 0.1], [0.3, 0.2]], rtol=1e-5)
 
 

@@ -2,11 +2,13 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import ones_of
 from simple_physics import SimplePhysics
 
 import dexsim
@@ -16,6 +18,7 @@ from dexsim.core.config import setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
+from dexsim.env.task import reward_of
 from dexsim.errors import ConfigError
 
 WORLDS = 4
@@ -94,18 +97,18 @@ def env():
 
 def test_it_runs_from_reset_to_restart(env):
     """In `SimplePhysics` an object falls freely: it is lost after sqrt(2 reach / g), and the episode begins again."""
-    state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
-    assert state.obs["actor"].shape == (WORLDS, 12 + 5) and state.obs["critic"].shape == (WORLDS, 24)
 
     @functools.partial(jit, once=True)
     @jax.vmap
-    def advance(state, action):
-        after = env.step(state, action)
-        return after, env.restart(after, after.terminated)
+    def advance(state, ended):
+        after = env.step(state, jnp.zeros(env.action_size))
+        return after, env.restart(after, ended | after.terminated)
 
+    _, state = advance(ones_of(env, WORLDS), jnp.ones(WORLDS, bool))
+    assert state.obs["actor"].shape == (WORLDS, 12 + 5) and state.obs["critic"].shape == (WORLDS, 24)
     lost = int(np.ceil(np.sqrt(2 * env.config.reach / 9.81) / env.control_period))
     for tick in range(1, lost + 1):
-        state, again = advance(state, jnp.zeros((WORLDS, env.action_size)))
+        state, again = advance(state, jnp.zeros(WORLDS, bool))
         np.testing.assert_array_equal(state.metrics["ticks"], tick - 1)  # of the goal that held during the tick
         np.testing.assert_array_equal(state.terminated, tick >= lost)
         np.testing.assert_allclose(state.reward, np.where(tick >= lost, -1.0, 1.0 - state.metrics["distance"]))
@@ -113,26 +116,25 @@ def test_it_runs_from_reset_to_restart(env):
     np.testing.assert_allclose(again.physics.qpos[:, 12], env.config.height)
 
 
+def outcome(*gives):
+    task = SimpleNamespace(name="balance", reward=lambda *_: gives)
+    return reward_of(task, None, None, jnp.zeros((), bool))
+
+
 @pytest.mark.parametrize("reward", [True, np.float64(1.0), jnp.float16(1.0)])
-def test_a_reward_may_be_any_number(env, monkeypatch, reward):
+def test_a_reward_may_be_any_number(reward):
     """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
-    monkeypatch.setattr(Balance, "reward", lambda *_: (reward, {}))
-
-    def run(state):
-        return jax.lax.scan(lambda state, _: (env.step(state, jnp.zeros(env.action_size)), None), state, None, 3)[0]
-
-    state = jax.eval_shape(lambda key: run(env.reset(key)), jax.random.key(0))
-    assert (state.reward.shape, state.reward.dtype) == ((), jnp.float32)
+    found, _ = outcome(reward, {})
+    assert (found.shape, found.dtype, float(found)) == ((), jnp.float32, 1.0)
 
 
 @pytest.mark.parametrize(
-    "method, gives, message",
+    ("reward", "metrics", "message"),
     [
-        ("reward", (jnp.zeros(2), {}), r"reward must be a scalar; got shape \(2,\)"),
-        ("reward", (0.0, {"far": jnp.zeros(3)}), r"far must be a scalar; got shape \(3,\)"),
+        (jnp.zeros(2), {}, r"reward must be a scalar; got shape \(2,\)"),
+        (0.0, {"far": jnp.zeros(3)}, r"far must be a scalar; got shape \(3,\)"),
     ],
 )
-def test_rules_that_give_something_else_are_one_line(env, monkeypatch, method, gives, message):
-    monkeypatch.setattr(Balance, method, lambda *_: gives)
+def test_rules_that_give_something_else_are_one_line(reward, metrics, message):
     with pytest.raises(ConfigError, match=f"^task 'balance': {message}"):
-        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(env.action_size)), jax.random.key(0))
+        outcome(reward, metrics)

@@ -1,6 +1,7 @@
 """The C backend against closed forms and a second scene in C MuJoCo; its calls from XLA; rubber of any thickness."""
 
 import dataclasses
+import functools
 import os
 import signal
 import subprocess
@@ -101,7 +102,7 @@ class TestClosedForms:
         target, state = map(row0, at(grips[:1], AWAY, velocity=[0.1, 0, 0, 0, 0, 0]))
         advance = jax.jit(lambda held: physics.advance(hold, target, state, jnp.ones(3), held=held))
         free, held = advance(jnp.array(False)).state, advance(jnp.array(True)).state
-        assert_same(free, physics.advance(hold, target, state, jnp.ones(3)).state)
+        assert_same(free, jax.jit(lambda: physics.advance(hold, target, state, jnp.ones(3)))().state)
         np.testing.assert_array_equal(held.qpos[12:], state.qpos[12:])
         np.testing.assert_array_equal(held.qvel[12:], 0.0)
         np.testing.assert_allclose(held.warmstart[12:15], 0.0, atol=1e-4)  # no acceleration by gravity or push
@@ -149,7 +150,8 @@ def test_batches_of_any_size_and_order_loops_and_scans_give_the_same_bits(physic
         part = jax.tree.map(lambda x, rows=rows: x[rows], (target, state, push))
         assert_same(tick(*part), jax.tree.map(lambda x, rows=rows: x[rows], whole))
     one = jax.tree.map(lambda x: x[3], (target, state))
-    assert_same(physics.advance(hold, *one, jnp.zeros(3)), jax.tree.map(lambda x: x[3], whole))
+    single = jax.jit(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3)))(*one)
+    assert_same(single, jax.tree.map(lambda x: x[3], whole))
     square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), (target, state, push))
     nested = jax.jit(jax.vmap(jax.vmap(lambda t, s, p: physics.advance(hold, t, s, p))))(*square)
     assert_same(jax.tree.map(lambda x: x.reshape(4, *x.shape[2:]), nested), whole)
@@ -193,7 +195,7 @@ class TestTrouble:
         monkeypatch.setattr(scene_model, "_set_options", cramped)
         target, state, _ = batch_of(grips)
         physics = make(hand)
-        tick = jax.vmap(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3)))
+        tick = jax.jit(jax.vmap(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3))))
         with pytest.raises(jax.errors.JaxRuntimeError, match="<size memory"):
             jax.block_until_ready(tick(target, state))
 
@@ -277,18 +279,22 @@ def grip(hand, grasp_env):
 def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compiled):
     """Less than no rubber is no rubber."""
     object, state, torque = grip
-    motors = lambda *_: jnp.asarray(torque)  # noqa: E731
-    drawn, force = scenes[THICK].advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=change)
-    expected, pressed = scenes[compiled].advance(motors, object, state, jnp.zeros(3))
+
+    @functools.cache
+    def advance(cover):
+        physics, motors = scenes[cover], lambda *_: jnp.asarray(torque)
+        return jax.jit(lambda delta: physics.advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=delta))
+
+    (drawn, force), (expected, pressed) = advance(THICK)(change), advance(compiled)(0.0)
     np.testing.assert_allclose(force, pressed, atol=2e-3)
     np.testing.assert_allclose(drawn.qpos, expected.qpos, atol=1e-5)
-    plain = scenes[THICK].advance(motors, object, state, jnp.zeros(3))[1]
+    plain = advance(THICK)(0.0)[1]
     assert np.abs(plain - force).max() > 0.5, "the rubber makes no difference: the test tests nothing"
 
 
 def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
     """C MuJoCo leaves out contacts of geoms whose bounding spheres are apart."""
-    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], None, THICK - THIN)
+    model, given = scenes[THIN].mj_model, jax.jit(lambda: scenes[THIN].configure(grip[0], None, THICK - THIN))()
     size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
     assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import warp_emulation
 
-from dexsim.core.errors import AssetError
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.scene import MAX_CONTACTS, Buffer, declare_args, find_links, kernel_constants
 from dexsim.physics.interface import PhysicsScene
@@ -39,15 +38,14 @@ CASES = [
 
 
 @functools.cache
-def scene_of(slots: tuple[str, ...], extra: str = "") -> PhysicsScene:
-    """A scene of `HAND` and an object of primitives `slots`; `extra` is the kind of one more geom of the hand."""
+def scene_of(slots: tuple[str, ...]) -> PhysicsScene:
+    """A scene of `HAND` and an object of primitives `slots`."""
     random = np.random.default_rng(len(slots))
     spec = mujoco.MjSpec()
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_MULTICCD
     spec.option.cone, spec.option.timestep = mujoco.mjtCone.mjCONE_ELLIPTIC, 0.006
     solid = {"mass": 1, "inertia": [1, 1, 1], "explicitinertial": True}
-    hand = HAND | ({"extra": (extra, [0.01, 0.01, 0.01])} if extra else {})
-    for name, (kind, size) in hand.items():
+    for name, (kind, size) in HAND.items():
         body = spec.worldbody
         if kind != "plane":
             body = body.add_body(name=name, **solid)
@@ -58,7 +56,7 @@ def scene_of(slots: tuple[str, ...], extra: str = "") -> PhysicsScene:
     body.add_freejoint()
     for k, kind in enumerate(slots):
         body.add_geom(name=f"object_{k}", type=geom_type(kind), size=[0.02] * 3, contype=0, conaffinity=0)
-        for name, (own, _) in hand.items():
+        for name, (own, _) in HAND.items():
             if own != "box" or kind == "box":
                 spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=3)
     for one, two in WITHIN:
@@ -290,9 +288,3 @@ def test_deepest_contacts_of_a_mesh_are_kept():
         np.testing.assert_allclose(np.sort(rows["gap"][:number]), deepest, atol=1e-5)
         crowded += world.data.ncon > MAX_CONTACTS
     assert crowded > 3
-
-
-@pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
-def test_kinds_without_contacts_are_named(kind):
-    with pytest.raises(AssetError, match=f"hand.xml: backend cuda has no contacts of {kind} 'extra' on box 'object_0'"):
-        kernel_constants(scene_of(("box",), kind))

@@ -10,9 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from episodes import still_moment
-from simple_physics import SimplePhysics
 
-import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
@@ -55,6 +53,11 @@ def task(hand):
     return Grasp(CONFIG, hand)
 
 
+@pytest.fixture(scope="module")
+def reward_of(task):
+    return jax.jit(task.reward)
+
+
 def gauss(error, sigma):
     return math.exp(-error * error / (2 * sigma * sigma))
 
@@ -79,7 +82,7 @@ class TestTerms:
 
 
 class TestReward:
-    def test_every_term_of_a_tick(self, hand, task):
+    def test_every_term_of_a_tick(self, hand, reward_of):
         """One moment, every term worked out by hand."""
         force = np.zeros((5, 3))
         force[0], force[1], force[3] = (0, 0, 2.0), (3.0, 4.0, 0), (0, 0.005, 0)
@@ -102,7 +105,7 @@ class TestReward:
             normal_force=[1.5, 4.5, 0, 0, 0],
             touch=Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)),
         )
-        reward, metrics = task.reward(goal_of(0.5), truth, jnp.zeros((), bool))
+        reward, metrics = reward_of(goal_of(0.5), truth, jnp.zeros((), bool))
 
         # Target 4 N; thumb 2 N (loose), index 5 N (tracks), ring 5 mN (no contact).
         track = 0.6 * math.exp(-0.5) + 0.4 * gauss(0.1, 0.4)
@@ -124,7 +127,7 @@ class TestReward:
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
         assert float(reward) == pytest.approx(sum(wanted.values()), rel=1e-4)
-        _, harder = task.reward(goal_of(0.5), make_moment(hand, finger_force=2 * force), jnp.zeros((), bool))
+        _, harder = reward_of(goal_of(0.5), make_moment(hand, finger_force=2 * force), jnp.zeros((), bool))
         assert float(harder["reward/overload"]) == pytest.approx(-2.0 * (10.0 - 4.0 - 1.0) / 10)
         known = {
             "success": 1.0,
@@ -142,12 +145,12 @@ class TestReward:
         for name, value in known.items():
             assert float(metrics[name]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
 
-    def test_a_drop_is_paid_once_and_ends_what_is_earned(self, hand, task):
+    def test_a_drop_is_paid_once_and_ends_what_is_earned(self, hand, reward_of):
         force = jnp.full((5, 3), 1.0)
         away = np.array(CENTRE) + [0.2, 0.0, 0.0]
         truth = make_moment(hand, finger_force=force, object_position=away)
-        _, held = task.reward(goal_of(0.2), truth, jnp.zeros((), bool))
-        reward, lost = task.reward(goal_of(0.2), truth, jnp.ones((), bool))
+        _, held = reward_of(goal_of(0.2), truth, jnp.zeros((), bool))
+        reward, lost = reward_of(goal_of(0.2), truth, jnp.ones((), bool))
         assert float(held["reward/force"]) > 0 and float(held["reward/drop"]) == 0
         assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "drop")] == [0.0, 0.0, 0.0, -20.0]
         assert float(lost["success"]) == 0.0
@@ -184,24 +187,6 @@ class TestChance:
         assert changed.mean() == pytest.approx(0.005, abs=4 * math.sqrt(0.005 / self.KEYS))
         assert 0 <= new[changed].min() and new[changed].max() < 1
         assert new[changed].mean() == pytest.approx(0.5, abs=0.12)
-
-
-class TestRelease:
-    def test_the_object_is_held_until_it_is_let_go(self, monkeypatch):
-        """For 0.1 s, four ticks; then it falls freely in `SimplePhysics`."""
-        monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        config = GraspConfig(
-            pool_size=4, objects=ObjectConfig(shapes=("sphere",)), release_delay=(0.1, 0.1), push_probability=0.0
-        )
-        env = dexsim.make("grasp", config, backend="c")
-        state, step, heights = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step), []
-        for _ in range(7):
-            state = step(state, jnp.zeros(12))
-            heights.append(float(state.physics.qpos[12]))
-        assert heights[:4] == [heights[0]] * 4
-        steps = env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
-        fall = 0.5 * 9.81 * steps * (steps + 1) * env.config.physics.timestep**2
-        np.testing.assert_allclose(np.array(heights[4:]) - heights[3], fall, rtol=0.02)
 
 
 class TestEvaluationPlan:

@@ -18,21 +18,27 @@ def with_geoms(hand, change):
     return dataclasses.replace(hand, geoms=tuple(geom for old in hand.geoms if (geom := change(old)) is not None))
 
 
+def gap(hand, joints, shape, place):
+    """`clearance` of an object that is not turned."""
+    return float(jax.jit(lambda place: clearance(hand, joints, shape, place, jnp.eye(3)))(place))
+
+
 def test_spheres_count_and_a_hand_of_a_palm_alone_is_refused(hand):
     balls = with_geoms(hand, lambda g: dataclasses.replace(g, kind="sphere") if g.kind == "capsule" else g)
-    shape = sample_object(jax.random.key(0), ObjectConfig()).shape()
+    shape = jax.jit(lambda key: sample_object(key, ObjectConfig()))(jax.random.key(0)).shape()
     joints, away = jnp.zeros(hand.num_joints), jnp.array([1.0, 0.0, 0.1])
     middle = max(float(np.linalg.norm(np.asarray(geom.position))) for geom in hand.geoms)
-    assert 0.5 - middle < float(clearance(balls, joints, shape, away, jnp.eye(3))) < 1.0
+    assert 0.5 - middle < gap(balls, joints, shape, away) < 1.0
     with pytest.raises(AssetError, match="no capsule, sphere or box has contype"):
-        clearance(with_geoms(hand, lambda g: g if g.kind == "box" else None), joints, shape, away, jnp.eye(3))
+        gap(with_geoms(hand, lambda g: g if g.kind == "box" else None), joints, shape, away)
 
 
 def test_boxes_of_links_count(hand):
     """An object in a link's box is not clear of it."""
     link, joints = hand.body_names.index("right_hand_mid_link1"), jnp.zeros(hand.num_joints)
-    place = forward_kinematics(hand, joints).body_position[link] + jnp.array([0.0, 0.0, 0.02])
-    shape = sample_object(jax.random.key(0), ObjectConfig()).shape()
+    pose = jax.jit(forward_kinematics, static_argnums=0)(hand, joints)
+    place = pose.body_position[link] + jnp.array([0.0, 0.0, 0.02])
+    shape = jax.jit(lambda key: sample_object(key, ObjectConfig()))(jax.random.key(0)).shape()
 
     def boxed(geom):
         if geom.kind != "capsule":
@@ -41,5 +47,5 @@ def test_boxes_of_links_count(hand):
         return dataclasses.replace(geom, kind="box", size=size) if geom.body == link else None
 
     boxes = with_geoms(hand, boxed)
-    assert float(clearance(boxes, joints, shape, place, jnp.eye(3))) < -0.005
-    assert float(clearance(boxes, joints, shape, place + jnp.array([0.2, 0.0, 0.0]), jnp.eye(3))) > 0.1
+    assert gap(boxes, joints, shape, place) < -0.005
+    assert gap(boxes, joints, shape, place + jnp.array([0.2, 0.0, 0.0])) > 0.1

@@ -111,7 +111,8 @@ def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
                 np.testing.assert_allclose(moments, 0.1 * 1e-3, rtol=1e-3)
 
 
-WIDE = dataclasses.replace(SMALL, initial_std=1.0)  # actions beyond what the environment takes
+# Actions beyond what the environment takes; one update.
+WIDE = dataclasses.replace(SMALL, initial_std=1.0, epochs=1, minibatches=1)
 
 
 class Watched(TinyEnv):
@@ -137,7 +138,7 @@ def test_every_group_has_the_statistics_of_its_own_observations():
 
 def test_the_first_minibatch_meets_the_policy_that_collected_it():
     """With the normalisers of the collection: the divergence is zero, and no ratio is clipped."""
-    training = training_of(dataclasses.replace(SMALL, epochs=1, minibatches=1))
+    training = training_of(WIDE, Watched)
     state = training.init(jax.random.key(0))
     for _ in range(3):
         state, metrics = training.step(state)

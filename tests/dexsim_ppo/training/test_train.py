@@ -3,16 +3,13 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
+import threading
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import tiny_train
-from paths import ROOT
 from tiny_env import TinyConfig, TinyEnv
 from tiny_train import PER_ITERATION
 
@@ -148,15 +145,20 @@ def exit_code(main, arguments):
     return stop.value.code
 
 
-def test_a_signal_saves_and_says_how_to_go_on(tmp_path):
-    command = [sys.executable, tiny_train.__file__, *QUICK, "--minutes", "5", "--run-dir", str(tmp_path / "a")]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})
-    metrics, deadline = tmp_path / "a" / "metrics.jsonl", time.time() + 600
-    while time.time() < deadline and not (metrics.exists() and metrics.stat().st_size):
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=600)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert f"--resume {tmp_path / 'a'}" in out.splitlines()[-1]
-    assert RunFolder(tmp_path / "a").latest_checkpoint().exists()
+def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys):
+    folder, over = RunFolder(tmp_path / "a"), threading.Event()
+
+    def stop():
+        while not over.wait(0.02):
+            if folder.metrics.exists() and folder.metrics.stat().st_size:
+                os.kill(os.getpid(), signal.SIGTERM)
+                return
+
+    threading.Thread(target=stop, daemon=True).start()
+    try:
+        code = train.main([*QUICK, "--minutes", "5", "--run-dir", str(folder.path)])
+    finally:
+        over.set()
+    assert code == 128 + signal.SIGTERM
+    assert f"--resume {folder.path}" in capsys.readouterr().out.splitlines()[-1]
+    assert folder.latest_checkpoint().exists()

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 import tiny_train
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import TinyEnv
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import train
@@ -18,8 +18,6 @@ GOOD_ITERATIONS = 3
 class Breaks(TinyEnv):
     """From its 24th step on, the actors of environments that started on the right side observe NaN."""
 
-    share = 0.0
-
     def _start(self, key):
         state = super()._start(key)
         return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
@@ -30,7 +28,7 @@ class Breaks(TinyEnv):
     def step(self, state, action):
         age = state.metrics["age"] + 1
         state = super().step(state, action)
-        broken = (age >= 8 * GOOD_ITERATIONS) & (state.target > self.share)
+        broken = (age >= 8 * GOOD_ITERATIONS) & (state.target > 0.0)
         actor = state.obs["actor"].at[1].set(jnp.where(broken, jnp.nan, state.obs["actor"][1]))
         return dataclasses.replace(
             state,
@@ -41,18 +39,9 @@ class Breaks(TinyEnv):
         )
 
 
-def install(patch, env_class):
-    def make(task, config=None, *, backend="auto", **_):
-        return env_class(config or TinyConfig(), backend=backend)
-
-    tiny_train.install(patch)
-    patch.setattr("dexsim.registry.make", make)
-    patch.setattr("dexsim.make", make, raising=False)
-
-
 def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch, capsys):
     """By then the newest checkpoints hold the fault: only those up to the last sound iteration are named."""
-    install(monkeypatch, Breaks)
+    tiny_train.install(monkeypatch, Breaks)
     folder = RunFolder(tmp_path / "run")
     options = ["--minutes", "5", "--run-dir", str(folder.path), "--checkpoint-every", "1", "--keep-checkpoints"]
     with pytest.raises(DexsimError, match=f"after iteration {GOOD_ITERATIONS}; no checkpoint is from before"):
