@@ -7,6 +7,7 @@ import hashlib
 import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -107,11 +108,36 @@ def shipped_name(path: Path) -> str:
     return ""
 
 
+def read_mjcf(path: Path) -> bytes:
+    """A file's content; of an MJCF that includes others, with their content in its place."""
+    data = path.read_bytes()
+    if b"<include" not in data:
+        return data
+    model = ElementTree.fromstring(data)
+    _paste_includes(model, path.parent, path.parent)
+    return ElementTree.tostring(model)
+
+
+def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
+    """MuJoCo looks beside the model first, in `top`, then beside the file that includes, in `folder`."""
+    children = []
+    for child in list(element):
+        if child.tag != "include":
+            _paste_includes(child, top, folder)
+            children.append(child)
+            continue
+        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
+        included = ElementTree.parse(file).getroot()
+        _paste_includes(included, top, file.parent)
+        children += included
+    element[:] = children
+
+
 def digest_of(*files: Path) -> str:
     """A hash of the content of a hand's files."""
     digest = hashlib.sha256()
     for path in files:
-        data = path.read_bytes()
+        data = read_mjcf(path)
         digest.update(len(data).to_bytes(8, "little") + data)
     return digest.hexdigest()
 
@@ -143,8 +169,6 @@ def _load(path: Path, source: str) -> Hand:
     if (table.taxel_pitch is None) != bool(table.taxels):
         raise ConfigError("give either taxels (a file) or taxel_pitch (a lattice on each finger's pad)")
     files = [path, path.parent / table.model]
-    if b"<include" in files[1].read_bytes():  # what changes there would go unnoticed
-        raise ConfigError(f"{table.model}: <include> is not supported: paste the file in its place")
     model = mujoco.MjModel.from_xml_path(str(files[1]))
     joints = [model.joint(name).id for name in table.joints]
     followers = _read_followers(model, joints)

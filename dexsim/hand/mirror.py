@@ -25,7 +25,7 @@ from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
 from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR
 from dexsim.hand.description import Hand
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import load_hand, read_mjcf
 
 OTHER = {"right": "left", "left": "right"}
 Point = TypeVar("Point", bound=tuple[float, ...])
@@ -181,7 +181,7 @@ def write_mirror(path: Path, folder: Path) -> Path:
     if toml.exists():
         raise AssetError(f"{toml}: exists; give another folder with --out")
     text = path.read_text()
-    model = ElementTree.parse(hand.model_path).getroot()
+    model = ElementTree.fromstring(read_mjcf(hand.model_path))
     files = dict(_gather_files(model, hand.model_path.parent))
     mirror_mjcf(model)
     comment = f" Mirror image of {hand.model_path.name} in the plane y = 0. "

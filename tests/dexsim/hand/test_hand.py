@@ -180,7 +180,6 @@ BROKEN = {
     "no torque limit": ("xml", BEND, 'axis="-1 0 0" range="-0.174 0.174"', "actuatorfrcrange"),
     "unknown joint": ("toml", '"index_bend",', '"index_bent",', "Invalid name 'index_bent'"),
     "root joint of another finger": ("toml", 'root_joint = "mid_joint1"', 'root_joint = "ring_joint1"', "not move"),
-    "included file": ("xml", "<worldbody>", "<include file='taxels.xml'/><worldbody>", "<include> is not supported"),
     "misspelt entry": ("toml", "palm = ", "taxel_pich = 1\npalm = ", "'taxel_pich'"),
     "posture in degrees": ("toml", "posture = [1.45", "posture = [83", "83 rad of 'thumb_bend'"),
     "column outside": ("csv", "thumb,0,1,", "thumb,10,1,", ":3: column 10"),

@@ -4,11 +4,13 @@ import dataclasses
 import shutil
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
 from dexsim.hand.load import load_hand
+from dexsim.hand.mirror import is_mirror_image, write_mirror
 from dexsim.hand.source import check_same, record_of, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.policy import load_policy
@@ -37,6 +39,23 @@ def test_default_hand_has_no_record(hand):
     assert load_hand("xhand_right").source == hand.source == "xhand_right"
     with pytest.raises(AssetError, match="hand 'nohand': no such file, and no shipped hand has that name"):
         load_hand("nohand")
+
+
+def test_what_a_hand_includes_is_in_its_hash_and_its_mirror_image(own, tmp_path):
+    """MuJoCo finds included files beside the model, or beside the file that includes them."""
+    own = Path(own).resolve()  # MuJoCo misses the file of a file where the model's path is relative
+    folder = own.parent
+    (folder / "parts").mkdir()
+    replace(folder / "xhand_right.xml", "<worldbody>", "<include file='parts/a.xml'/><worldbody>")
+    for place in (folder / "parts/b.xml", folder / "b.xml"):
+        (folder / "parts/a.xml").write_text("<mujoco><include file='b.xml'/></mujoco>")
+        place.write_text("<mujoco><custom><numeric name='x' data='1'/></custom></mujoco>")
+        before = load_hand(own).digest
+        place.write_text("<mujoco><custom><numeric name='x' data='2'/></custom></mujoco>")
+        assert load_hand(own).digest != before
+    image = load_hand(write_mirror(own, tmp_path / "left"))
+    assert mujoco.MjModel.from_xml_path(str(image.model_path)).numeric("x").data == 2
+    assert is_mirror_image(image, load_hand(own))
 
 
 def test_policy_carries_its_hand(own, tmp_path):
