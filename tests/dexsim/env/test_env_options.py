@@ -17,7 +17,7 @@ from dexsim.sensing.config import Sensing
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 
-KEY = jax.random.key(0)
+WORLDS = 16
 POOR_TAXELS = TaxelSensor(
     hysteresis=(0.0, 0.3),
     crosstalk=(0.0, 0.1),
@@ -44,11 +44,22 @@ def env():
         return dexsim.make("grasp", config, backend="c")
 
 
-def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(env, hand):
-    """Of a state with ones everywhere only what is done is drawn; sizes stay as the pool has them."""
-    state = jax.vmap(env.set_randomization_scale)(ones_of(env, 16, jnp.ones(16)), jnp.zeros(16))
-    begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(16) < 12)
-    np.testing.assert_array_equal(begun.episode.hand.encoder_bias[:, 0], np.arange(16) >= 12)
+@pytest.fixture(scope="module")
+def restarted(env):
+    """`restarted(scale, done)`: a batch that was ones everywhere, in which a new episode begins where `done`."""
+    restart = jit(jax.vmap(env.restart), once=True)
+
+    def at(scale, done):
+        state = jax.vmap(env.set_randomization_scale)(ones_of(env, WORLDS, jnp.ones(WORLDS)), jnp.full(WORLDS, scale))
+        return restart(state, done)
+
+    return at
+
+
+def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(env, restarted, hand):
+    """Only what is done is drawn; sizes stay as the pool has them."""
+    begun = restarted(0.0, jnp.arange(WORLDS) < 12)
+    np.testing.assert_array_equal(begun.episode.hand.encoder_bias[:, 0], np.arange(WORLDS) >= 12)
     np.testing.assert_array_equal(begun.scale, 0.0)
     episode, objects = jax.tree.map(lambda leaf: leaf[:12], begun.episode), env.config.objects
     for value, nominal in (
@@ -75,22 +86,21 @@ def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(env, hand):
 
 
 @pytest.fixture(scope="module")
-def begun(env):
-    """Eight episodes, and the compiled step."""
-    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(KEY)
-    return states, jit(jax.vmap(env.step), once=True)
+def begun(env, restarted):
+    """Episodes that begin, and the compiled step."""
+    return restarted(1.0, jnp.ones(WORLDS, bool)), jit(jax.vmap(env.step), once=True)
 
 
 def test_an_object_is_held_until_it_is_let_go(env, begun):
     """For 0.1 s, four ticks; then it falls freely."""
     (state, step), heights = begun, []
     for _ in range(7):
-        state = step(state, jnp.zeros((8, 12)))
+        state = step(state, jnp.zeros((WORLDS, 12)))
         heights.append(np.asarray(state.physics.qpos[:, 12]))
     np.testing.assert_array_equal(heights[:4], [heights[0]] * 4)
     steps = env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
     fall = 0.5 * 9.81 * steps * (steps + 1) * env.config.physics.timestep**2
-    np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], 8), rtol=0.02)
+    np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], WORLDS), rtol=0.02)
 
 
 def test_every_error_of_taxels_reaches_their_readings_and_nothing_else(begun):

@@ -65,8 +65,9 @@ def learner(kind):
 
 @functools.cache
 def experience(kind):
-    """A rollout of that state, and the samples that the update would see."""
+    """A rollout from that state with something in its memory, and the samples that the update would see."""
     env, config, _, state = learner(kind)
+    state = dataclasses.replace(state, carry=jnp.full_like(state.carry, 0.1))  # amid episodes
 
     @jax.jit
     def collect(state):
