@@ -77,8 +77,8 @@ def check_taxels(hand: Hand) -> str:
         parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.KINDS]
         if not parts:
             continue
-        poses = (np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation"))
-        shape = sdf.Shape(tuple(part.kind for part in parts), *poses, np.ones(len(parts), bool))
+        size, place, turn = (np.stack([getattr(p, name) for p in parts]) for name in ("size", "position", "rotation"))
+        shape = sdf.Shape(tuple(p.kind for p in parts), size, place, turn, np.ones(len(parts), bool))
         position, normal = hand.taxel_position[finger], hand.taxel_normal[finger]
         distance, ahead = (np.asarray(sdf.signed_distance(position + s * normal, shape)) for s in (0.0, _STEP))
         depth, away = -1e3 * distance.min(), 1e3 * distance.max()
