@@ -103,7 +103,8 @@ def test_latency_holdout_and_report():
 @pytest.mark.slow
 def test_a_dead_band_is_found():
     log = log_of(TRUTH, 6, target=SHORT)
-    result = identify(log, GUESS, fit=("stiffness", "damping", "coulomb_friction"), latencies=(2,))
+    known = TRUTH | dict(stiffness=3.5, damping=0.13, coulomb_friction=0.0, dead_band=0.0)
+    result = identify(log, known, fit=("stiffness", "damping", "coulomb_friction"), latencies=(2,))
     assert result.rmse < 0.0011
     for name in result.fitted:
         low, high = result.intervals[name]
