@@ -98,6 +98,16 @@ def test_broken_files_are_one_clear_line(name, folder, capsys):
     assert len(failed) == count and failed[0].startswith(f"FAIL  {check}: ") and re.search(said, failed[0]), failed
 
 
+def test_a_hand_that_nothing_can_touch_gets_its_whole_report(folder, capsys):
+    """Some checks cannot be made of it."""
+    model = folder / "xhand_right.xml"
+    model.write_text(re.sub(r'(contype|conaffinity)="\d"', r'\1="0"', model.read_text()))
+    assert check_hand.main([str(folder / "xhand_right.toml")]) == 1
+    failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
+    assert failed[0].startswith("FAIL  fingertips touch: finger 'thumb' has no primitive at its tip that touches")
+    assert failed[-1].startswith("FAIL  fingertips reach the object: ") and "contype or conaffinity" in failed[-1]
+
+
 def test_mesh_that_touches_is_refused(folder, capsys):
     model, corners = folder / "xhand_right.xml", "0 0 0  0.01 0 0  0 0.01 0  0 0 0.01"
     text = model.read_text().replace("<worldbody>", f'<asset><mesh name="hull" vertex="{corners}"/></asset><worldbody>')
