@@ -101,8 +101,7 @@ def train_policy(
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
     given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)}
-    if "steps" in options and "minutes" not in options:
-        given["minutes"] = 0.0
+    default = _with_budget(default, {name for name, value in options.items() if value is not None})
     if options.get("run_dir"):
         options["run_dir"] = Path(options["run_dir"])
     given |= options
@@ -254,6 +253,13 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
         return arguments_from_dict(find_task(task or saved["task"]).config_class, saved)
 
 
+def _with_budget(default: TrainArguments, given: set[str]) -> TrainArguments:
+    """The defaults without their own steps where minutes alone are given, and the other way round."""
+    other = {"steps": "minutes", "minutes": "steps"}
+    lifted: dict[str, Any] = {other[name]: 0.0 for name in given & other.keys() if other[name] not in given}
+    return dataclasses.replace(default, **lifted)
+
+
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, Source]:
     """The command's options, and what the run begins from."""
     # The defaults of all options depend on these.
@@ -275,8 +281,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, Source]:
     else:
         source = find_source(given.task, given.policy, given.resume)
         default = default_arguments(given.task, preset, source)
-    if given.steps and not given.minutes:
-        default = dataclasses.replace(default, minutes=0.0)
+    default = _with_budget(default, {name for name, value in vars(given).items() if value})
     generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
     options = generic[type(default.env)]
     arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)

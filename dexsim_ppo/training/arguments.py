@@ -46,7 +46,8 @@ class TrainArguments(Config, Generic[EnvConfig]):
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)
-    """Stop after this many steps, including those before a resume; 0 for no limit."""
+    """Stop after this many steps, including those before a resume; 0 for no limit. With --minutes and without --steps
+    there is no limit."""
     minutes: float = setting(0.0, unit="min", low=0.0)
     """Budget of training time, including compilation and the time before a resume; 0 for no limit. With --steps and
     without --minutes there is no limit."""

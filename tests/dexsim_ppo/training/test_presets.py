@@ -54,6 +54,21 @@ def test_default_settings_are_those_that_trained_the_tasks(name, task):
     assert preset.extremes == (0.6 if name == "gpu" and task != "rotate_any" else 0.0)
 
 
+@pytest.mark.parametrize(
+    ("given", "budget"),
+    [
+        ("", (0.0, 2.5e8)),
+        ("--minutes 30", (30.0, 0.0)),
+        ("--steps 1e6", (0.0, 1e6)),
+        ("--steps 1e6 --minutes 2", (2.0, 1e6)),
+    ],
+)
+def test_a_budget_that_is_given_takes_the_place_of_the_presets(given, budget):
+    """Thirty minutes are not cut off by the steps that a preset counts."""
+    arguments, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", *given.split()])
+    assert (arguments.minutes, arguments.steps) == budget
+
+
 def test_extremes_and_no_force_loop_are_for_training_alone():
     """Evaluations and the policy's file have the task's own configuration."""
     plain, _ = train.parse_arguments(["--task", "grasp", "--preset", "gpu"])
