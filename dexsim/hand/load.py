@@ -111,7 +111,7 @@ def shipped_name(path: Path) -> str:
 def read_mjcf(path: Path) -> bytes:
     """A file's content; of an MJCF that includes others, with their content in its place."""
     data = path.read_bytes()
-    if b"<include" not in data:
+    if path.suffix != ".xml" or b"<include" not in data:
         return data
     model = ElementTree.fromstring(data)
     _paste_includes(model, path.parent, path.parent)

@@ -113,7 +113,7 @@ class Panel:
                 draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
         x, y = self._slots[-1]
         # Above the colour scale; a small panel has little room.
-        room = pad + height - max(4, cell) - pad
+        room = height - max(4, cell)
         pitch = min(round(1.35 * font_size), room // max(len(captions) + len(lines), 1))
         small = _font(min(font_size - 2, pitch))
         for caption in captions:
