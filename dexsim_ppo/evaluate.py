@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -235,7 +234,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     arguments = cli.parse(
         EvaluateArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_ppo.evaluate",
         description="Measure a policy over fixed, seeded episodes.",
     )

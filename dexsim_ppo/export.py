@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -243,7 +242,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     arguments = cli.parse(
         ExportArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_ppo.export",
         description="Write a policy as an ONNX model, or as a bundle for a robot's computer.",
     )

@@ -11,7 +11,6 @@ writes the same formats from such a log. An .npz holds what the live view draws,
 import dataclasses
 import io
 import operator
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -109,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     arguments = cli.parse(
         RecordArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_ppo.record",
         description="Record simulated episodes of a policy for other programs.",
     )

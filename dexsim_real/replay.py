@@ -8,7 +8,6 @@ frame is missing: they are not recomputed.
 """
 
 import dataclasses
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -171,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
     arguments = cli.parse(
         ReplayArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_real.replay",
         description="Recompute and plot the log of a run on the hand.",
     )

@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     arguments = cli.parse(
         CalibrateArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_real.calibrate",
         description=__doc__.splitlines()[0],
     )

@@ -22,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run or something is missing."""
     arguments = cli.parse(
         RunArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_real.run",
         description="Run a policy on the hand.",
     )

@@ -11,7 +11,6 @@ import dataclasses
 import select
 import shlex
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -198,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     arguments = cli.parse(
         TwinArguments,
-        sys.argv[1:] if argv is None else argv,
+        argv,
         prog="python -m dexsim_real.twin",
         description="Emulate a hand on a pseudo-terminal.",
     )
