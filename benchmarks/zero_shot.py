@@ -37,6 +37,7 @@ TARGETS = {
     "grasp": "held 90 %, r 0.8",
     "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall",
     "rotate_any": "40 successes",
+    "rotate_clear": "none",
 }
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 

@@ -65,7 +65,7 @@ class EmulatedHand:
 
     Args:
       hand: model of the hand.
-      task: "grasp" or "rotate".
+      task: of `parameters.TASKS`.
       seed: of all random numbers.
       trials: number of trials, after which the hand stays empty; None is no limit.
       kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
@@ -219,8 +219,8 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
-        fingers, side = self.hand.num_fingers, self.hand.thumb_side
-        self._referee = Referee(self.task, self._start.reference, self._seconds, fingers, side)
+        start, fingers, side = self._start, self.hand.num_fingers, self.hand.thumb_side
+        self._referee = Referee(self.task, start.reference, start.axis, self._seconds, fingers, side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -317,7 +317,8 @@ class EmulatedHand:
         look = Look(
             position=data.qpos[at : at + 3].copy(),
             quat=quat,
-            spin=float((matrix(quat) @ data.qvel[dof + 3 : dof + 6])[0]),
+            velocity=matrix(quat) @ data.qvel[dof + 3 : dof + 6],
+            height=float(data.qpos[at]) - self.shape.reach(matrix(quat).T @ [-1.0, 0.0, 0.0]) - self._palm_face,
             force=np.linalg.norm(force, axis=-1),
             normal=normal,
             taxels=self._samples[-1][1][..., 2].sum(-1),

@@ -20,8 +20,9 @@ from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 
 KINDS = ("outside", "inside", "nominal")
-TASKS = ("grasp", "rotate", "rotate_any")
-"""rotate_any: boxes and cylinders in place of a cube, on a palm that leans as in training."""
+TASKS = ("grasp", "rotate", "rotate_any", "rotate_clear")
+"""rotate_any: boxes and cylinders in place of a cube, on a palm that leans as in training; rotate_clear: the fingers
+hold the cube clear of the palm."""
 NEAR, FAR = 0.05, 0.15  # beyond an edge, as shares of the range's width
 EXCHANGE_COMMAND = 0.007  # s from a policy tick to the board: half a period at 83 Hz and 1 ms on the wire
 EXCHANGE_SENSE = 0.0146  # s from the board to a policy tick: 8.6 ms of reply and half a period
@@ -150,6 +151,7 @@ OF_THE_FILE = frozenset(
 )
 """Parameters that a plant model has its own values for."""
 
+TASK_BANDS["rotate_clear"] = TASK_BANDS["rotate"]
 TASK_BANDS["rotate_any"] = TASK_BANDS["rotate"] | {
     "edge": Band(0.045, 0.065, "m", "", 0.055, sides="within"),
     "proportions": Band(0.9, 1.1, "1", "", 1.0, "axis", sides="within"),

@@ -2,7 +2,8 @@
 
 No sensor, calibration or goal of the runner is used. The rules are those of the tasks. A grasped object is lost beyond
 0.12 m from its nominal position. A cube has reached a goal within 0.3 rad and 0.05 m (the paper's count) and at no more
-than 2 rad/s (the task's count); it is lost beyond 0.07 m, or when tipped by 1 rad.
+than 2 rad/s (the task's count); it is lost beyond 0.07 m, when tipped by 1 rad, or, held clear of the palm, when it
+touches the palm.
 
 A loss has one of these causes, the first that holds:
 
@@ -10,7 +11,8 @@ A loss has one of these causes, the first that holds:
 - disturbed: a push acted on it within the last half second
 - trapped: a cube stood tilted on one fingertip or none for most of the last two seconds
 - at the torque limit: a joint was, for most of the last half second with a touch
-- tipped: a cube's axis left the palm's normal
+- tipped: a cube's axis left the axis of rotation
+- on the palm: a cube that is held clear of it came down on it
 - pushed out, slipped: a fingertip touched in the last 0.2 s, or none did
 """
 
@@ -35,7 +37,7 @@ _SETTLE = 3.0  # s after release before forces count
 _RECENT = 0.2  # s; a fingertip that touched this shortly before a drop pushed the object out
 _LEAD, _TRAP = 0.5, 2.0  # s before a drop in which its cause shows; in which a trap does
 _TRAPPED = 0.35  # rad, tilt of a cube in a trap
-_AXIS = np.array([1.0, 0.0, 0.0])
+ON_PALM = 0.001  # m, height above the palm at which a cube touches it
 
 
 class Look(NamedTuple):
@@ -43,7 +45,8 @@ class Look(NamedTuple):
 
     position: np.ndarray  # [3] m of the object
     quat: np.ndarray  # [4]
-    spin: float  # rad/s about the palm's normal
+    velocity: np.ndarray  # [3] rad/s of the object
+    height: float  # m of its lowest point above the palm
     force: np.ndarray  # [F] N on the fingertips
     normal: np.ndarray  # [F] N, its part along the contact's normal
     taxels: np.ndarray  # [F] N on the taxels
@@ -57,18 +60,18 @@ class Look(NamedTuple):
         """Number of fingertips that touch the object."""
         return int(np.sum(self.force > TOUCH))
 
-    @property
-    def tilt(self) -> float:
-        """Angle rad between the object's x and the palm's normal."""
-        return math.acos(float(np.clip(matrix(self.quat)[:, 0] @ _AXIS, -1.0, 1.0)))
+    def tilt(self, axis: np.ndarray) -> float:
+        """Angle rad between an axis [3] and where the object has carried it."""
+        return math.acos(float(np.clip(matrix(self.quat) @ axis @ axis, -1.0, 1.0)))
 
 
 class Referee:
     """Follows one trial from release to end.
 
     Args:
-      task: "grasp" or "rotate".
+      task: "grasp", "rotate", ...
       reference: [3] m, nominal position of the object.
+      axis: [3] of the rotation.
       seconds: time limit; None is that of the task.
       fingers: their number.
       thumb_side: the hand's; the goals of a left hand are those of its mirror image.
@@ -78,11 +81,12 @@ class Referee:
         self,
         task: str,
         reference: np.ndarray,
+        axis: np.ndarray,
         seconds: float | None = None,
         fingers: int = 5,
         thumb_side: float = 1.0,
     ):
-        task = skill_of(task)
+        self._axis, self._clear, task = np.asarray(axis), task == "rotate_clear", skill_of(task)
         self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
@@ -109,7 +113,8 @@ class Referee:
         self._looks.append((self.time, look))
         while self._looks[0][0] < self.time - _TRAP:
             self._looks.popleft()
-        if away > LOST[self.task] or (self.task == "rotate" and look.tilt > TIPPED):
+        fallen = self.task == "rotate" and look.tilt(self._axis) > TIPPED or self._clear and look.height < ON_PALM
+        if away > LOST[self.task] or fallen:
             self.end = f"dropped: {self._cause(away)}"
             return
         if self.task == "rotate":
@@ -130,7 +135,7 @@ class Referee:
         """Why the object is lost, which now is `away` m from its place; see the head of this module."""
         last = [look for time, look in self._looks if time >= self.time - _LEAD]
         touched = [look.limited for look in last if look.touching]
-        trapped = [look.tilt > _TRAPPED and look.touching <= 1 for _, look in self._looks]
+        trapped = [look.tilt(self._axis) > _TRAPPED and look.touching <= 1 for _, look in self._looks]
         if not self._gripped:
             return "untouched"
         if any(look.disturbed for look in last):
@@ -140,17 +145,18 @@ class Referee:
         if touched and np.mean(touched) > 0.5:
             return "at the torque limit"
         if away <= LOST[self.task]:
-            return "tipped"
+            return "on the palm" if self._clear and last[-1].height < ON_PALM else "tipped"
         return "pushed out" if self.time - self._touched <= _RECENT else "slipped"
 
     def _count_goals(self, look: Look, away: float) -> None:
-        """Goals are 90 degrees apart about the palm's normal, from the first heading on."""
-        if self._heading is None:  # Angle of the rotation about x nearest to the orientation.
-            self._heading = 2 * math.atan2(look.quat[1], look.quat[0])
+        """Goals are 90 degrees apart about the axis, from the first heading on."""
+        if self._heading is None:  # Angle of the rotation about it nearest to the orientation.
+            self._heading = 2 * math.atan2(look.quat[1:] @ self._axis, look.quat[0])
+        spin = abs(float(look.velocity @ self._axis))
         for name, fastest in _FASTEST.items():
-            goal = turn(_AXIS, self._heading + (self.goals[name] + 1) * self._step)
+            goal = turn(self._axis, self._heading + (self.goals[name] + 1) * self._step)
             apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], look.quat)[0]))))
-            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(look.spin) <= fastest
+            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and spin <= fastest
 
     def report(self) -> dict[str, Any]:
         """Metrics so far; JSON-able.

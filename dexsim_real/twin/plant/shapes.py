@@ -71,7 +71,7 @@ def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: st
     """Sample the object of a trial: a cube to rotate, or a box or upright cylinder; to grasp, one of `SHAPES`, or
     the named one."""
     which, box_body = rng.choice(SHAPES), rng.random() < 0.5
-    if parameters.task == "rotate":
+    if parameters.task in ("rotate", "rotate_clear"):
         edge = parameters.edge / 2
         return ObjectShape("box", (Primitive("box", (edge, edge, edge)),))
     if parameters.task == "rotate_any":

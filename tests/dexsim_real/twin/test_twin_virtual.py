@@ -175,6 +175,6 @@ def test_both_worlds_name_forces_alike(benchmark):
     """What the referee reports is what the task's report reduces, name by name."""
     from dexsim.tasks.grasp.report import FORCES, window
 
-    judge = Referee("grasp", np.zeros(3))
+    judge = Referee("grasp", np.zeros(3), np.eye(3)[0])
     assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
     assert judge.window == window(judge.limit) == (3.0, 8.0)

@@ -5,6 +5,7 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 from paths import ROOT
@@ -12,13 +13,14 @@ from paths import ROOT
 import dexsim_real.twin.plant
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
+from dexsim.tasks.rotate.objects import CLEARANCE
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand, referee
-from dexsim_real.twin.plant.assistant import ROTATE_PLACE, nominal_gravity, start_of
+from dexsim_real.twin.plant.assistant import is_clear, nominal_gravity, start_of
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.parameters import FAR, NEAR, PUSHES, TASKS, bands, sample_trial
+from dexsim_real.twin.plant.parameters import FAR, NEAR, PUSHES, bands, sample_trial, skill_of
 
-SKILLS = TASKS[:2]  # rotate_any shares all but its objects and its mount with rotate
+SKILLS = ("grasp", "rotate", "rotate_clear")  # rotate_any shares all but its objects and its mount with rotate
 
 
 def _lookup(config, path):
@@ -49,7 +51,7 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     from dexsim_ppo.policy import load_policy
 
     shipped = load_policy(task).env_config
-    for config in (to_dict(TRAINED[task].config_class()), shipped):
+    for config in (to_dict(TRAINED[task].config()), shipped):
         for name, band in trained_bands(task).items():
             trained = _lookup(config, band.origin)
             low, high = (
@@ -60,29 +62,44 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
             if (task, name) == ("rotate", "latency") and high > band.high:  # trained on later hands than these
                 continue
             assert (band.low, band.high) == pytest.approx((low, high)), name
-        assert PUSHES[task][1] == config["push_speed"]
-        assert PUSHES[task][0] == pytest.approx(
+        skill = skill_of(task)
+        assert PUSHES[skill][1] == config["push_speed"]
+        assert PUSHES[skill][0] == pytest.approx(
             config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
         )
-        assert referee.LOST[task] == config["drop_distance"]
-        assert referee.LIMITS[task] == config["evaluation_seconds"]
-    rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
+        assert referee.LOST[skill] == config["drop_distance"]
+        assert referee.LIMITS[skill] == config["evaluation_seconds"]
+    rules = TRAINED[task].task(TRAINED[task].config(), hand)
     start = start_of(hand, task)
     assert start.reference == pytest.approx(rules.reference)
     assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
     assert nominal_gravity(task) == pytest.approx(rules.gravity)
-    if task == "rotate":
+    if skill == "rotate":
+        assert start.axis == pytest.approx(rules.turn.unit_axis) and referee.ON_PALM == CLEARANCE
         turn = rules.config.turn
         ours = (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
         assert ours == pytest.approx((turn.step, turn.angle, turn.distance, turn.spin, rules.config.drop_tilt))
 
 
-def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
+@pytest.mark.parametrize("task", ("rotate", "rotate_clear"))
+def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path, task):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-    entry = TRAINED["rotate"]
-    rules = entry.task(dataclasses.replace(entry.config_class(), pool_size=64), hand)
-    starts = rules.make_pool(jax.random.key(0)).qpos[:, 13:15]
-    assert np.all(np.abs(starts.mean(0) - ROTATE_PLACE) < 0.6 * starts.std(0))
+    entry = TRAINED[task]
+    rules = entry.task(dataclasses.replace(entry.config(), pool_size=64), hand)
+    starts, place = rules.make_pool(jax.random.key(0)).qpos[:, 12:15], start_of(hand, task).place
+    assert np.all(np.abs(starts.mean(0)[-len(place) :] - place) < 0.6 * starts.std(0)[-len(place) :])
+
+
+def test_a_cube_between_the_fingertips_is_put_where_they_carry_it(hand):
+    """A millimetre lower it would overlap with them."""
+    for trial in range(3):
+        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial)
+        place, scene, data = plant._place, plant._scene, mujoco.MjData(plant._scene.model)
+        scene.set_joints(data, plant._start.posture)
+        assert [is_clear(scene, data, place.position - drop * plant.up, place.quat) for drop in (0.0, 0.001)] == [
+            True,
+            False,
+        ]
 
 
 def test_the_fingers_leave_room_where_a_cube_is_put(hand, monkeypatch):

@@ -9,16 +9,18 @@ from dexsim_real.twin.plant import referee
 from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.shapes import product, turn
 
+X = np.array((1.0, 0.0, 0.0))
 PLACE = np.array((0.047, 0.024, 0.088))  # nominal, of the object
 
 
-def seen(position, quat=(1.0, 0, 0, 0), spin=0.0, force=0.0, limited=False, disturbed=False):
+def seen(position, quat=(1.0, 0, 0, 0), spin=X * 0.0, force=0.0, limited=False, disturbed=False, height=0.01):
     force = np.broadcast_to(force, 5).astype(float)
     joints = np.full(12, 0.3), np.full(12, 0.5)
     return Look(
         np.asarray(position, float),
         np.asarray(quat, float),
         spin,
+        height,
         force,
         0.8 * force,
         0.5 * force,
@@ -28,15 +30,15 @@ def seen(position, quat=(1.0, 0, 0, 0), spin=0.0, force=0.0, limited=False, dist
     )
 
 
-def look(judge, quat, spin=0.0, away=0.0, step=0.01):
+def look(judge, quat, spin=X * 0.0, away=0.0, step=0.01):
     """One look at a cube that nobody touches, `away` m from its nominal position."""
     judge.watch(step, seen(PLACE + (away, 0, 0), quat, spin))
 
 
-def spinning(rate, seconds, heading=0.05, step=0.01):
-    judge = Referee("rotate", PLACE)
+def spinning(rate, seconds, heading=0.05, step=0.01, axis=X):
+    judge = Referee("rotate", PLACE, axis)
     for k in range(round(seconds / step) + 1):
-        look(judge, turn((1, 0, 0), heading + rate * k * step), rate)
+        look(judge, turn(axis, heading + rate * k * step), rate * axis)
     return judge.goals["task"], judge.goals["paper"]
 
 
@@ -47,10 +49,11 @@ def test_goals_of_a_steady_turn():
         assert spinning(1.0, goals * quarter - referee.GOAL_ANGLE - 0.02) == (goals - 1, goals - 1)
     assert spinning(-1.0, 1.0) == (0, 0)
     assert spinning(3.0, 10.0) == (0, 19)  # Too fast for the task, not for the paper.
+    assert spinning(1.0, 5.0, axis=np.array((0.6, 0.0, -0.8))) == (3, 3)
 
 
 def test_a_goal_needs_the_whole_orientation_and_the_place():
-    judge, quarter = Referee("rotate", PLACE), turn((1, 0, 0), math.pi / 2)
+    judge, quarter = Referee("rotate", PLACE, X), turn((1, 0, 0), math.pi / 2)
     look(judge, turn((1, 0, 0), 0.0))
     look(judge, quarter, away=0.06)
     look(judge, product(turn((0, 0, 1), 0.35), quarter))
@@ -61,10 +64,10 @@ def test_a_goal_needs_the_whole_orientation_and_the_place():
 
 def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0), limited=0.0, push=()):
     """A trial with a look each 10 ms; `limited`: share of looks with a joint at its limit, `push`: when one acts."""
-    judge = Referee(task, PLACE, seconds)
+    judge = Referee(task, PLACE, X, seconds)
     for k, position in enumerate(positions):
         force, now = (part(k) if callable(part) else part for part in (tips, quat))
-        judge.watch(0.01, seen(position, now, 0.0, force, k % 10 < 10 * limited, k in push))
+        judge.watch(0.01, seen(position, now, X * 0.0, force, k % 10 < 10 * limited, k in push))
     return judge
 
 
@@ -90,8 +93,16 @@ def test_drops_and_their_causes():
     assert "before" not in kept
 
 
+def test_a_cube_held_clear_of_the_palm_is_lost_on_it():
+    for task, end in (("rotate", ""), ("rotate_clear", "dropped: on the palm")):
+        judge = Referee(task, PLACE, X)
+        for height in (0.01, 0.0005):
+            judge.watch(0.01, seen(PLACE, force=1.0, height=height))
+        assert judge.end == end
+
+
 def test_forces_of_a_grasp_are_means_from_three_seconds_on():
-    judge = Referee("grasp", PLACE)
+    judge = Referee("grasp", PLACE, X)
     for k in range(801):
         force = np.array((9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else [50.0] * 5)
         judge.watch(0.01, seen(PLACE, force=force, limited=k % 4 == 0))
