@@ -14,8 +14,8 @@ from dexsim_real.control.controller import Controller, Tick
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.camera import ObjectEstimate, ObjectSensors
 from dexsim_real.sensors.imu import IDENTITY, conjugate, multiply
-from dexsim_real.sensors.object_sensors import ObjectEstimate, ObjectSensors
 
 _PATIENCE = 60.0  # s to wait until the camera sees the object
 _SMOOTH = 0.1  # s, of the object's angular velocity
@@ -111,10 +111,7 @@ class PolicyLoop:
         if now >= ready and self.objects.ready():
             return False
         if now > ready + _PATIENCE:
-            raise HandError(
-                "the camera does not see the object; check the light, the colour thresholds "
-                "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
-            )
+            raise HandError("the camera does not see the object; check light, --optics.hsv-low, -high and .min-area")
         posture = self.controller.spec.posture if self._approach > 0 else None
         goal = self._start if posture is None else np.asarray(posture, np.float32)
         share = min((now - self._begin) / self._approach, 1.0) if self._approach > 0 else 1.0

@@ -13,8 +13,8 @@ from dexsim_real.control import policy_loop
 from dexsim_real.control.controller import Tick
 from dexsim_real.control.policy_loop import TurnGoals
 from dexsim_real.control.safety import Reaction
+from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.imu import IDENTITY, ImuReader, encode
-from dexsim_real.sensors.object_sensors import ObjectEstimate
 
 
 class Still:

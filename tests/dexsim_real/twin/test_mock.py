@@ -1,4 +1,4 @@
-"""Mocks of hands that are no XHand: what guards motors holds for every driver, and the commands work on them."""
+"""Mocks of hands that are no XHand: the commands work on them."""
 
 import json
 
@@ -12,7 +12,7 @@ from dexsim_real import replay
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
 from dexsim_real.run import __main__ as run
@@ -28,17 +28,16 @@ MOCK = "sdk:dexsim_real.twin.mock"
 class Bench:
     """A mock, its port and the exchange loop, in their own time."""
 
-    def __init__(self, name, measures=WITHOUT, **limits):
+    def __init__(self, name, measures=WITHOUT):
         self.hand, self.time = load_hand(name), 0.0
         clock = lambda: self.time  # noqa: E731
         self.driver = MockHand(EmulatedHand(self.hand, "grasp", kind="nominal"), measures, clock)
         self.port = DriverPort(self.driver, self.hand, LinkConfig(), clock=clock)
-        self.safety = Safety(self.hand, SafetyConfig(**limits))
+        self.safety = Safety(self.hand, SafetyConfig())
         sensing = HandSensing(self.hand, HardwareConfig())
         self.loop = ExchangeLoop(self.port, sensing, self.safety, 83.0, clock=clock, sleep=self.sleep)
         self.port.connect()
         self.loop.tare()
-        self.commands = []  # [J] rad of each exchange with the motors on
 
     def sleep(self, seconds):
         self.time += seconds
@@ -49,8 +48,6 @@ class Bench:
             if target is not None:
                 self.safety.set_target(target, self.time)
             self.loop.cycle()
-            if self.on:
-                self.commands.append(self.driver.motors["position"].copy())
             self.loop.pace.wait()
 
     @property
@@ -63,43 +60,13 @@ class Bench:
         assert self.on
 
 
-def test_limits_of_angle_and_speed_and_the_slow_start():
-    bench = Bench("inspire_like", speed=2.0)
-    hand, start = bench.hand, bench.safety.sample.measured.joint_position
-    bench.engage()
-    np.testing.assert_allclose(bench.commands[0], start, atol=0.02)
-    gains = []
-    for _ in range(80):
-        bench.run(0.012, hand.joint_upper + 0.5)
-        gains.append(bench.driver.motors["kp"][0])
-    assert gains[0] < 30 and sorted(gains) == gains and gains[-1] == 100, "stiffness grows from nothing"
-    bench.run(3.0, hand.joint_upper + 0.5)
-    steps = np.abs(np.diff(bench.commands, axis=0)).max(1)
-    assert steps.max() <= 2.0 * 0.03 + 1e-5 and steps[:30].max() < 0.5 * 0.015
-    ends = hand.joint_upper - 0.03
-    assert np.max(bench.commands - ends) < 1e-5 and np.isclose(bench.commands[-1], ends, atol=1e-5).mean() > 0.5
-    bench.loop.close()
-    assert not bench.on and not bench.loop.driven
-
-
-def test_the_object_is_felt_too_much_force_holds_and_a_hand_without_sensors_still_moves():
-    """The hand goes to its start posture, the object is let go over it, and the fingers close."""
-    bench = Bench("leap_like", finger_force=4.0)
+def test_an_object_that_is_let_go_over_the_hand_is_felt():
+    bench = Bench("leap_like")
     bench.engage()
     posture = np.array(bench.hand.grasp_posture)
     bench.run(3.0, posture)
-    forces, held = [], 0
-    for _ in range(200):
-        bench.run(0.012, posture + 0.6)
-        forces.append(bench.safety.sample.measured.finger_force.max())
-        held += bench.safety.last == (Reaction.HOLD, "the fingertip force is too high")
-    assert max(forces) > 1.0 and (held > 0) == (max(forces) > 4.0)
-    bench = Bench("leap_like", measures=())
-    bench.engage()
-    bench.run(2.0, posture)
-    measured = bench.safety.sample.measured
-    assert np.isnan(measured.current).all() and not measured.joint_torque.any() and not bench.safety.latched
-    np.testing.assert_allclose(measured.joint_position, posture, atol=0.2)
+    bench.run(2.0, posture + 0.6)
+    assert bench.safety.sample.measured.finger_force.max() > 1.0 and not bench.safety.latched
 
 
 @pytest.mark.usefixtures("jax_as_it_is")

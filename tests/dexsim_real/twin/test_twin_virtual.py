@@ -155,20 +155,11 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
     assert benchmark.table(metrics, benchmark.simulated("grasp", "grasp"), {}).count("(saturates)") == 1
 
 
-def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):
-    torque = np.zeros(12)
-    torque[hand.root_joint] = (0.5, -0.3, 0.2, 0.1, 0.4)
-    measured = SimpleNamespace(finger_force=np.array([1.0, 2.0, 0.0, 3.0, 0.0]))
-    trace = [
-        {
-            "time": time,
-            "tick": SimpleNamespace(readings=SimpleNamespace(joint_torque=k * torque)),
-            "measured": measured,
-        }
-        for time, k in ((10.0, 9.0), (12.9, 9.0), (13.5, 1.0), (15.0, 2.0), (18.0, 9.0))
-    ]
-    assert benchmark._measured_torque(trace, hand, [3.0, 8.0]) == pytest.approx(1.5 * (0.5 + 0.3 + 0.1))
-    assert benchmark._measured_torque(trace[:2], hand, [3.0, 8.0]) == 0.0
+def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark):
+    torque, force = np.array((0.5, -0.3, 0.2, 0.1, 0.4)), np.array([1.0, 2.0, 0.0, 3.0, 0.0])
+    trace = [(time, k * torque, force) for time, k in ((10.0, 9), (12.9, 9), (13.5, 1), (15.0, 2), (18.0, 9))]
+    assert benchmark._measured_torque(trace, [3.0, 8.0]) == pytest.approx(1.5 * (0.5 + 0.3 + 0.1))
+    assert benchmark._measured_torque(trace[:2], [3.0, 8.0]) == 0.0
 
 
 def test_both_worlds_name_forces_alike(benchmark):

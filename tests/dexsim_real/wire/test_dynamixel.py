@@ -16,7 +16,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.driver import DriverPort, JointTargets
-from dexsim_real.wire.dynamixel import DynamixelHand, crc16, packet, take_answers
+from dexsim_real.wire.dynamixel import DynamixelHand, crc16, make_parser, packet
 from dexsim_real.wire.link import LinkConfig
 
 IDS = [12, 13, 14, 15, 1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11]
@@ -60,10 +60,9 @@ def test_packets_are_those_of_the_manual():
 )
 def test_answers_are_found_between_noise_in_pieces_of_any_size(contents, noise, size):
     """Contents full of halves of headers; the answers were stuffed by other code."""
-    stream, buffer, found = b"".join(noise + status(3, 0, data) for data in contents), bytearray(), []
+    stream, parser, found = b"".join(noise + status(3, 0, data) for data in contents), make_parser(), []
     for at in range(0, len(stream), size):
-        buffer += stream[at : at + size]
-        found += take_answers(buffer)
+        found += parser.feed(stream[at : at + size])
     assert [answer.data for answer in found] == contents
 
 
