@@ -80,7 +80,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         seconds=options["seconds"],
         trials=1,
         first=number,
-        shape=shape,
+        shape_name=shape,
         plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])

@@ -43,39 +43,32 @@ class LoopOptions(Config):
     """Safety limits."""
 
 
+@dataclasses.dataclass(eq=False)
 class ExchangeLoop:
     """Exchanges commands and states with a hand, one `cycle` at a time.
 
     `retared` is called with the number of the exchange from which on another tare may hold, and with lines about it.
-
-    Args:
-      port: connected; used by this loop only.
-      rate: exchanges per second.
-      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
-      track_taxels: follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured.
-      clock, sleep: replace those of `time`, for simulated time.
     """
 
-    def __init__(
-        self,
-        port: HandPort,
-        sensing: HandSensing,
-        safety: Safety,
-        rate: float,
-        beat: Callable[[float], None] = lambda more: None,
-        *,
-        track_taxels: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
-        self.port, self.sensing, self.safety, self.clock = port, sensing, safety, clock
-        self.pace, self._beat = Pace(rate, clock, sleep), beat
+    port: HandPort  # connected; used by this loop only
+    sensing: HandSensing
+    safety: Safety
+    rate: float  # exchanges per second
+    beat: Callable[[float], None] = lambda more: None
+    """Called before every exchange as a sign of life, with the time s by which the next call may be late."""
+    _: dataclasses.KW_ONLY
+    track_taxels: bool = True
+    """Follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured."""
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+    def __post_init__(self) -> None:
+        self.pace = Pace(self.rate, self.clock, self.sleep)
         self.round_trip = Timing()
-        self.command = passive_command(sensing.hand.num_joints)  # the newest that was sent
+        self.command = passive_command(self.sensing.hand.num_joints)  # the newest that was sent
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
-        self.track_taxels = track_taxels
-        self._filter = VelocityFilter(sensing.hand.num_joints)
+        self._filter = VelocityFilter(self.sensing.hand.num_joints)
         self._generation: int | None = None
         self._engage = False
 
@@ -85,7 +78,7 @@ class ExchangeLoop:
 
     def cycle(self) -> HandSample | None:
         """One exchange; None without an answer. `Safety.problem` tells whether the sample is a measurement."""
-        self._beat(0.0)
+        self.beat(0.0)
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -132,7 +125,7 @@ class ExchangeLoop:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._closed, seconds = True, PATIENCE if self.driven else BRIEF
-        self._beat(seconds)
+        self.beat(seconds)
         try:
             if self.port.turn_off(off, seconds):
                 self.driven = False
@@ -228,23 +221,12 @@ class Timing:
         self.count += 1
         self.worst = max(self.worst, seconds)
 
-    def percentile(self, percent: float) -> float:
-        """Percentile of the samples in s; NaN when there are none."""
-        if not self.count:
-            return float("nan")
-        at = np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count)
-        return min((int(at) + 1) * _BIN, self.worst)
-
     def summary(self) -> dict[str, float]:
         """Percentiles in ms, number of samples, number of missed deadlines."""
-        p50, p99 = self.percentile(50), self.percentile(99)
-        return {
-            "count": self.count,
-            "missed": self.missed,
-            "p50_ms": 1e3 * p50,
-            "p99_ms": 1e3 * p99,
-            "max_ms": 1e3 * self.worst,
-        }
+        ranks = np.searchsorted(np.cumsum(self._bins), self.count * np.array([0.5, 0.99]))
+        p50, p99 = np.minimum((ranks + 1) * _BIN, self.worst).tolist()
+        numbers = {"p50_ms": 1e3 * p50, "p99_ms": 1e3 * p99, "max_ms": 1e3 * self.worst}
+        return {"count": self.count, "missed": self.missed, **numbers}
 
 
 class Pace:

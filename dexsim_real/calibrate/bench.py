@@ -128,12 +128,9 @@ class CalibrateArguments(LoopOptions):
 
 
 class Operator:
-    """The person beside the hand.
+    """The person beside the hand, who reads `out` and answers on `stream`, by default the standard input.
 
-    Args:
-      out: for output.
-      assume_yes: ask nothing and assume that every answer is yes.
-      stream: of the answers; None is the standard input.
+    With `assume_yes` nothing is asked, and every answer is yes.
     """
 
     def __init__(self, out: TextIO, *, assume_yes: bool = False, stream: TextIO | None = None):
@@ -263,9 +260,8 @@ class Bench(ExchangeLoop):
     def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> HandSample | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
 
-        Args:
-          target: [J] rad, requested joint targets; None keeps the last ones.
-          mark: annotation with which a sample that is not None is logged.
+        `target` [J] rad are the requested joint targets, None keeps the last ones; `mark` is the annotation with which
+        a sample is logged.
 
         Raises HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
         """

@@ -56,9 +56,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
         if arguments.joints and name not in arguments.joints:
             continue
         try:
-            log, holdout = (
-                joint_log(name, marks, hand, source, calibration) for marks in (signals["fit"], signals["hold-out"])
-            )
+            log, holdout = (joint_log(name, marks, hand, source, calibration) for marks in signals.values())
             joint = hand.joint_names.index(name)
             start = {
                 "stiffness": STIFFNESS,
@@ -67,13 +65,8 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 "no_load_speed": float(hand.speed_limit[joint]),
                 "inertia": float(model.dof_M0[model.joint(name).dofadr[0]]),  # kg m^2
             }
-            result = identify(
-                log,
-                start,
-                substeps=max(round(log.period / _TIMESTEP), 1),
-                dead_band=(0.0, 0.03) if arguments.dead_band else None,
-                holdout=holdout,
-            )
+            substeps, band = max(round(log.period / _TIMESTEP), 1), (0.0, 0.03) if arguments.dead_band else None
+            result = identify(log, start, substeps=substeps, dead_band=band, holdout=holdout)
         except DexsimError as error:
             failed[name] = error
             operator.tell(f"not identified: {name}: {error}")

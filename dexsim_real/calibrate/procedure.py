@@ -62,14 +62,8 @@ class Placement:
 
 
 def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
-    """All presses, pads first and the thumb's last of them.
-
-    Args:
-      fingers: names; all by default.
-      sides: also the sides of thumb and index finger.
-
-    Raises HandError: no such finger.
-    """
+    """All presses of these fingers (all by default): pads, the thumb's last; then, if `sides`, the sides of thumb and
+    index finger. HandError: no such finger."""
     if unknown := sorted(set(fingers) - set(hand.finger_names)):
         raise HandError(f"no finger {unknown[0]!r}; choose from {', '.join(hand.finger_names)}")
     selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
@@ -115,10 +109,8 @@ class PressProcedure:
 
     A press advances the joint targets along a direction in joint space. The direction in which every joint moves
     forward depends on the unpublished stiffness of the drives. It is therefore taken from the press before: the
-    distance by which each joint lagged its target, plus the same small motion for all.
-
-    Args:
-      bench: connected, motors off.
+    distance by which each joint lagged its target, plus the same small motion for all. The bench is connected, with the
+    motors off.
     """
 
     def __init__(self, bench: Bench):

@@ -147,8 +147,9 @@ def run_policy(
 
 def execute(arguments: RunArguments) -> RunResult:
     """Run with these options, within `stopping`; see `run_policy`."""
-    if not (arguments.yes or arguments.motors_off):
-        check_terminal()
+    asks = not (arguments.yes or arguments.motors_off)
+    if asks and not all(stream and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+        raise HandError("cannot ask for confirmation without a terminal; give --yes or --motors-off")
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)
@@ -270,8 +271,8 @@ class Session:
             self.safety,
             open_objects(arguments, self.controller),
             command=arguments.command,
-            approach=arguments.approach,
-            place=arguments.place,
+            approach_seconds=arguments.approach,
+            place_seconds=arguments.place,
             motors_off=arguments.motors_off,
         )
 
@@ -441,12 +442,6 @@ class Session:
                 "environment": cli.environment_report(),
             },
         )
-
-
-def check_terminal() -> None:
-    """Raises HandError: nobody can be asked, since input or error output is no terminal."""
-    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
-        raise HandError("cannot ask for confirmation without a terminal; give --yes or --motors-off")
 
 
 def ask() -> None:

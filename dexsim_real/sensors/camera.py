@@ -214,16 +214,15 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
         return _stream(spec.removeprefix("unix:"))
     if ":" in spec and not spec.startswith(("/", "rtsp:", "http")):
         return _camera("0", find_function(spec, spec, "MODULE:FUNCTION of an importable module"))
-    return _camera(spec, lambda picture: colour_mask(picture, config))
 
+    def colour_mask(picture: np.ndarray) -> np.ndarray:
+        import cv2
 
-def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
-    """Mask [H, W] of the pixels of a BGR picture within the colour thresholds, single pixels removed."""
-    import cv2
+        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+        mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
+        return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0  # Without single pixels.
 
-    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-    mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
-    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return _camera(spec, colour_mask)
 
 
 def encode_mask(when: float, mask: np.ndarray) -> bytes:

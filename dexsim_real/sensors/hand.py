@@ -196,14 +196,10 @@ class HandSensing:
         Gains are 0 in all modes but `POSITION`. `stiffness` is a share of the gains kp and ki in [0, 1]; those of
         damping are always whole. Raises HandError: an angle is not finite.
         """
-        on, (kp, ki, kd) = mode == Mode.POSITION, self._gains
+        on, (kp, ki, kd), current = mode == Mode.POSITION, self._gains, self.config.torque_max
+        reported, share = (np.asarray(position) - self._offset) * self._sign, stiffness * on
         block = frames.command_block(
-            (np.asarray(position) - self._offset) * self._sign,
-            kp=kp * stiffness * on,
-            ki=ki * stiffness * on,
-            kd=kd * on,
-            torque_max=self.config.torque_max * on,
-            mode=mode,
+            reported, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on, mode=mode
         )
         if not np.isfinite(block["position"]).all():
             raise HandError("a command is not finite; it was not sent")

@@ -73,13 +73,7 @@ class Twin:
     Raises HandError: a port or socket cannot be created.
     """
 
-    def __init__(
-        self,
-        arguments: TwinArguments,
-        plant: EmulatedHand,
-        folder: Path,
-        show: Callable[[str], None] = lambda text: None,
-    ):
+    def __init__(self, arguments: TwinArguments, plant: EmulatedHand, folder: Path, show: Callable[[str], None]):
         self.arguments, self.plant, self._show = arguments, plant, show
         self.start = self.now = time.monotonic()  # s; the plant's time by the wall clock
         self.slipped, self._noted_at = 0.0, -math.inf  # s
@@ -160,16 +154,8 @@ class Twin:
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
     """The physics for the options."""
-    return EmulatedHand(
-        hand,
-        arguments.task,
-        arguments.seed,
-        trials=arguments.trials,
-        first=arguments.first,
-        kind=arguments.parameters,
-        seconds=arguments.seconds,
-        plant_model=arguments.plant_model,
-    )
+    options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "plant_model")}
+    return EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.parameters, **options)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

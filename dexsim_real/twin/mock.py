@@ -21,12 +21,9 @@ _SLIP = 0.1  # s that the plant may be behind the clock; what is more is let go,
 
 
 class MockHand(HandDriver):
-    """A driver whose hand is emulated. The plant advances to the clock at each call.
+    """A driver whose hand is emulated. The plant advances to the `clock` (s) at each call.
 
-    Args:
-      plant: the hand and its object.
-      measures: what the hand has, names in `driver.WITHOUT`; all by default.
-      clock: s.
+    `measures` is what the hand has, names in `driver.WITHOUT`.
     """
 
     def __init__(

@@ -6,6 +6,7 @@ exchange is executed by the emulated palm board in the blocks of the wire, so qu
 wire.
 """
 
+import dataclasses
 import heapq
 import itertools
 from collections.abc import Callable, Iterator
@@ -142,39 +143,35 @@ def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
     return sensor
 
 
+@dataclasses.dataclass(eq=False)
 class VirtualRun:
     """One trial of a policy on an emulated hand: the bridge's loops, with the plant's time as their clock.
-
-    Args:
-      plant: a new one, before its first trial.
-      controller: warmed; it is restarted.
-      calibration: of this hand.
-      command: grip command in [0, 1].
-      limits: of the bridge's safety; None is its default.
 
     Raises HandError: the policy was trained with another mount than the emulated hand's.
     """
 
-    def __init__(
-        self,
-        plant: EmulatedHand,
-        controller: Controller,
-        calibration: Calibration,
-        command: float = 0.5,
-        limits: SafetyConfig | None = None,
-    ):
+    plant: EmulatedHand  # a new one, before its first trial
+    controller: Controller  # warmed; it is restarted
+    calibration: Calibration  # of this hand
+    command: float = 0.5  # grip command in [0, 1]
+    limits: SafetyConfig = SafetyConfig()  # of the bridge's safety
+
+    def __post_init__(self) -> None:
+        plant, controller = self.plant, self.controller
         trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task, plant.hand.thumb_side)
         if np.abs(trained - mounted).max() > 0.01:
             raise HandError(f"gravity {np.round(trained, 2)} in training, {np.round(mounted, 2)} here: another mount")
-        self.plant, self.controller, self._trial = plant, controller, plant.trial
-        self.safety = Safety(controller.hand, limits_for(limits or SafetyConfig(), controller))
+        self._trial = plant.trial
+        self.safety = Safety(controller.hand, limits_for(self.limits, controller))
         self.port = port = VirtualPort(plant)
-        sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
+        sensing = HandSensing(controller.hand, HardwareConfig(), self.calibration)
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
         objects = ObjectSensors(np.asarray(controller.spec.reference, float))
         objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
         objects.camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
-        self.policy = PolicyLoop(controller, self.safety, objects, command=command, approach=_APPROACH, place=_PLACE)
+        self.policy = PolicyLoop(
+            controller, self.safety, objects, command=self.command, approach_seconds=_APPROACH, place_seconds=_PLACE
+        )
 
     def run(self) -> dict[str, Any]:
         """Run the trial; returns its `report`."""

@@ -14,22 +14,10 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError, find_function, open_serial
-from dexsim_real.wire import frames
+from dexsim_real.wire import frames, link
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
-from dexsim_real.wire.link import (
-    SERIAL_NUMBER,
-    SIDE,
-    HandPort,
-    Identity,
-    LinkConfig,
-    ReconnectingPort,
-    Refusal,
-    Reply,
-    printable,
-    read_identity,
-    read_refusal,
-)
+from dexsim_real.wire.link import HandPort, Identity, LinkConfig, ReconnectingPort, Refusal, Reply
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -124,7 +112,7 @@ class SerialHand(ReconnectingPort):
             self.counts.silent += self._received == before
         elif answer.command == Command.ERROR:
             self.counts.refused += 1
-            self.refusal, answer = read_refusal(answer.data), None
+            self.refusal, answer = link.read_refusal(answer.data), None
         else:
             self.counts.answered += 1
         return answer, sent
@@ -195,14 +183,14 @@ class SerialHand(ReconnectingPort):
         while True:
             frame, _ = self._request(Command.VERSION, b"", 64)
             if frame is not None:
-                version = printable(frame.data) or frame.data.hex(" ")
+                version = link.printable(frame.data) or frame.data.hex(" ")
             if self._exchange(passive_command()) is not None:
                 return version
             if self._clock() > until:
                 raise HandError(self._silence())
 
     def _read_identity(self) -> Identity:
-        return read_identity(self._register(SERIAL_NUMBER), self._register(SIDE))
+        return link.read_identity(self._register(link.SERIAL_NUMBER), self._register(link.SIDE))
 
     def _register(self, number: int) -> bytes:
         """Content of a register; empty when the hand does not tell."""

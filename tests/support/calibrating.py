@@ -12,7 +12,7 @@ from dexsim_real.calibrate.procedure import placements
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.frames import Mode
 
-SHORT = PressConfig(cycles=3, seconds=3.0, approach_speed=0.3, first_speed=0.08)
+SHORT = PressConfig(cycles=3, seconds=4.0, approach_speed=0.3, first_speed=0.08)
 
 QUICK = PressConfig(cycles=1, seconds=1.0, approach_speed=0.5, first_speed=0.2, pause=0.2)
 

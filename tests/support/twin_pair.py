@@ -67,7 +67,7 @@ class Running:
 
     def __init__(self, folder, plant=None, **options):
         self.plant = plant or ScriptedPlant()
-        self.twin = Twin(TwinArguments(**options), self.plant, folder)
+        self.twin = Twin(TwinArguments(**options), self.plant, folder, lambda text: None)
         self.port = str(self.twin.line.terminal.name)
         self._thread = threading.Thread(target=self.twin.run, daemon=True)
         self._thread.start()

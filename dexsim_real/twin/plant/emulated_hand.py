@@ -84,54 +84,39 @@ class _Past(NamedTuple):
     current: np.ndarray
 
 
+@dataclasses.dataclass(eq=False)
 class EmulatedHand:
-    """A hand with an object, trial after trial. The owner advances its time.
-
-    Args:
-      hand: model of the hand.
-      task: "grasp" or "rotate".
-      seed: of all random numbers.
-      trials: number of trials, after which the hand stays empty; None is no limit.
-      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
-      overrides: fixed parameters (`sample_trial`).
-      seconds: time limit of a trial; None is that of the task.
-      shape: name of the objects (grasp); None samples one per trial.
-      first: number of the first trial. A trial does not depend on the trials before it.
-      plant_model: MJCF of a hand (`hand_model.read_model`): its body and contacts take the place of the emulated hand's
-        own.
+    """A hand with an object, trial after trial, none of which depends on another. The owner advances its time.
 
     Raises HandError: the plant model does not fit the hand, or decides an overridden parameter itself.
     """
 
-    def __init__(
-        self,
-        hand: Hand,
-        task: str,
-        seed: int = 0,
-        *,
-        trials: int | None = None,
-        kind: str = "outside",
-        overrides: Mapping[str, float] | None = None,
-        seconds: float | None = None,
-        shape: str | None = None,
-        first: int = 0,
-        plant_model: str | Path | None = None,
-    ):
-        self.hand, self.task = hand, task
-        self._model = read_model(plant_model, hand) if plant_model else own_model(hand)
-        if plant_model and (own := sorted(OF_THE_FILE & set(overrides or ()))):
-            raise HandError(f"{own[0]} is not a parameter of a plant model: change it in {plant_model}")
+    hand: Hand
+    task: str  # of `parameters.TASKS`
+    seed: int = 0  # of all random numbers
+    _: dataclasses.KW_ONLY
+    trials: int | None = None  # number of trials, after which the hand stays empty; None is no limit
+    kind: str = "outside"  # of `parameters.KINDS`
+    overrides: Mapping[str, float] | None = None  # fixed parameters (`sample_trial`)
+    seconds: float | None = None  # time limit of a trial; None is that of the task
+    shape_name: str | None = None  # of the objects (grasp); None samples one per trial
+    first: int = 0  # number of the first trial
+    plant_model: str | Path | None = None  # MJCF (`hand_model.read_model`) whose body and contacts replace our own
+
+    def __post_init__(self) -> None:
+        hand = self.hand
+        self._model = read_model(self.plant_model, hand) if self.plant_model else own_model(hand)
+        if self.plant_model and (own := sorted(OF_THE_FILE & set(self.overrides or ()))):
+            raise HandError(f"{own[0]} is not a parameter of a plant model: change it in {self.plant_model}")
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
         self._skin = EmulatedTaxels(hand, by_point=self._model.foreign)
         self.time, self._ticks, self._due = 0.0, 0, 0.0
         self._command: np.ndarray | None = None
         # The fingers of a hand without commands are slightly bent.
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
-        self.seed, self.kind, self._end = seed, kind, None if trials is None else first + trials
-        self._overrides, self._seconds, self._shape = overrides, seconds, shape
-        self._start = start_of(hand, task)
+        self._start = start_of(hand, self.task)
         self._done: list[dict[str, Any]] = []
-        self.trial = first - 1
+        self.trial = self.first - 1
         self._next_trial()
 
     def drive(self, command: np.ndarray) -> None:
@@ -214,7 +199,7 @@ class EmulatedHand:
 
     @property
     def _finished(self) -> bool:
-        return self._end is not None and self.trial >= self._end
+        return self.trials is not None and self.trial >= self.first + self.trials
 
     def _next_trial(self) -> None:
         self.trial += 1
@@ -223,8 +208,8 @@ class EmulatedHand:
             return
         rng = np.random.default_rng([self.seed, self.trial])
         for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
-            parameters = sample_trial(self.task, rng, self.kind, self._overrides, self.hand)
-            shape = sample_shape(parameters, rng, self._shape)
+            parameters = sample_trial(self.task, rng, self.kind, self.overrides, self.hand)
+            shape = sample_shape(parameters, rng, self.shape_name)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
             self._palm_face = palm_face(scene, tuple(self._start.place)) if self._model.foreign else own
@@ -236,7 +221,7 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         fingers, side = self.hand.num_fingers, self.hand.thumb_side
-        self._referee = Referee(self.task, self._start.reference, self._seconds, fingers, side)
+        self._referee = Referee(self.task, self._start.reference, self.seconds, fingers, side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()

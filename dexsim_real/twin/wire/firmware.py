@@ -173,11 +173,7 @@ class Terminal:
 class HandLine:
     """Serves one terminal. It has no clock: call `serve` with the time, often, and whenever `due` has passed.
 
-    Args:
-      terminal: the hand's end of the cable.
-      firmware: executes the requests.
-      seed: of the delays.
-      catch_up: called with a time s before the hand acts, to advance the plant to that time.
+    `catch_up` is called with a time in s before the hand acts, to advance the plant to that time; `seed` is of delays.
     """
 
     def __init__(self, terminal: Terminal, firmware: Firmware, catch_up: Callable[[float], None], seed: int = 0):

@@ -16,7 +16,7 @@ def trial(hand, controller_of):
         controller = controller_of(load_policy(name), hand)
         controller.warm()
         task = controller.policy.task
-        plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape="sphere")
+        plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape_name="sphere")
         report = VirtualRun(plant, controller, ideal_calibration(hand), command).run()
         assert report["bridge"]["latched"] == "", report
         return report

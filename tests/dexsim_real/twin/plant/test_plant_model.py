@@ -32,7 +32,7 @@ def write(tmp_path):
 def plant(hand, path=None, task="rotate", shape=None, **overrides):
     path, values = path or asset_path("plants/foreign_right.xml"), QUIET | IDEAL | overrides
     values |= {"push_rate": 0.0, "sensing_latency": 0.0}
-    return EmulatedHand(hand, task, 0, kind="nominal", overrides=values, shape=shape, plant_model=path)
+    return EmulatedHand(hand, task, 0, kind="nominal", overrides=values, shape_name=shape, plant_model=path)
 
 
 def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
