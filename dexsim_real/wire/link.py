@@ -240,29 +240,23 @@ class HandPort:
                 return False
 
 
+@dataclasses.dataclass(eq=False)
 class ReconnectingPort(HandPort):
-    """What ports have in common: a line that fails is opened again, after waits that double at each attempt.
+    """What ports have in common: a line that fails is opened again, after waits that double at each attempt."""
 
-    Args:
-      config: of the link; its `backoff` counts.
-      passive: the command that turns the motors off, until whose answer no other one is sent on a line that is new.
-      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
-      clock: s, in which replies are stamped; that of the exchange loop.
-    """
+    config: LinkConfig  # its `backoff` counts
+    passive: np.ndarray  # turns the motors off; until its answer no other command is sent on a line that is new
+    _: dataclasses.KW_ONLY
+    tap: Callable[[str, bytes], None] | None = None
+    """Called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`."""
+    clock: Callable[[], float] | None = None  # s, in which replies are stamped; that of the exchange loop
 
-    def __init__(
-        self,
-        config: LinkConfig,
-        passive: np.ndarray,
-        *,
-        tap: Callable[[str, bytes], None] | None = None,
-        clock: Callable[[], float] | None = None,
-    ):
-        self.config, self.counts = config, LinkCounts()
-        self._tap = tap or (lambda direction, data: None)
-        self._clock, self._sleep = clock or time.monotonic, time.sleep
+    def __post_init__(self) -> None:
+        self.counts = LinkCounts()
+        self._tap = self.tap or (lambda direction, data: None)
+        self._clock, self._sleep = self.clock or time.monotonic, time.sleep
         self._connected, self._returning, self._generation = False, False, 0
-        self._passive, self._retry_at, self._pause = passive, 0.0, config.backoff[0]
+        self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
     def exchange(self, command: np.ndarray) -> Reply | None:
         self.refusal = None
@@ -274,7 +268,7 @@ class ReconnectingPort(HandPort):
                 self._reopen()
                 self.counts.reconnects += 1
                 self._returning, self._pause = True, self.config.backoff[0]
-            reply = self._exchange(self._passive if self._returning else command)
+            reply = self._exchange(self.passive if self._returning else command)
         except OSError:  # Base class of pyserial's errors.
             self.close()
             self._retry_at = self._clock() + self._pause
