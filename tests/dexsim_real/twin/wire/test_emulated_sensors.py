@@ -38,10 +38,10 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
 
 
 def test_the_bridges_camera_sees_the_object(tmp_path):
+    begin = time.monotonic()
     with Running(tmp_path, task="grasp", seed=3) as running:
         masks = open_masks(f"unix:{running.twin.sensor.path}", OPTICS)
         sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
-        begin = time.monotonic()
         while not sensor.has_measurement or running.twin.sensor.sent < 10:
             time.sleep(0.01)
         when, position, _ = sensor.read()
