@@ -81,26 +81,28 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         seconds=options["seconds"],
         trials=1,
         first=number,
-        shape=shape,
+        shape_name=shape,
         plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
     run = VirtualRun(plant, controller, calibration, command, limits)
+    trace = [
+        (time, tick.readings.joint_torque[hand.root_joint], run.policy.sample.measured.finger_force)
+        for time, tick in run.ticking()
+    ]
+    report = run.report()
     if options["task"] == "grasp":
-        run.trace = []
-    report = run.run()
-    if options["task"] == "grasp":
-        report["total_torque"] = _measured_torque(run.trace, hand, report["window_s"])
+        report["total_torque"] = _measured_torque(trace, report["window_s"])
     return report | {"wall": round(time.perf_counter() - began, 2)}
 
 
-def _measured_torque(trace: list[dict[str, Any]], hand: Any, window: list[float]) -> float:
+def _measured_torque(trace: list[tuple[float, np.ndarray, np.ndarray]], window: list[float]) -> float:
     """Sum over touching fingers of the root joint's torque as a share of its limit, as the bridge measures it: mean
-    over the window [s]. The runner's clock starts with its first tick, when the object is let go."""
+    over the window [s]. The first entry of time, torque [F] and force [F] is when the object is let go."""
     sums = [
-        float(np.abs(entry["tick"].readings.joint_torque[hand.root_joint])[entry["measured"].finger_force > 0.0].sum())
-        for entry in trace
-        if window[0] <= entry["time"] - trace[0]["time"] < window[1]
+        float(np.abs(torque)[force > 0.0].sum())
+        for time, torque, force in trace
+        if window[0] <= time - trace[0][0] < window[1]
     ]
     return round(float(np.mean(sums)), 4) if sums else 0.0
 

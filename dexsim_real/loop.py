@@ -6,6 +6,7 @@ A run on a hand is this loop in a thread of its own (`LoopThread`), a calibratio
 
 import contextlib
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,14 +18,15 @@ from dexsim.core.config import Config, setting
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.process import ignore_signals, raise_priority
-from dexsim_real.core.timing import Pace, Timing
+from dexsim_real.core.process import EXCHANGE, change_priority, ignore_signals
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
 from dexsim_real.wire.frames import Mode, passive_command
 from dexsim_real.wire.link import BRIEF, PATIENCE, HandPort, LinkConfig, Reply
 
 TARE_SAMPLES = 30
 _TARE = 5.0  # s in which they must arrive
+_BIN, _BINS = 1e-5, 5000  # s and number: the histogram ends at 50 ms
+GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,39 +43,32 @@ class LoopOptions(Config):
     """Safety limits."""
 
 
+@dataclasses.dataclass(eq=False)
 class ExchangeLoop:
     """Exchanges commands and states with a hand, one `cycle` at a time.
 
     `retared` is called with the number of the exchange from which on another tare may hold, and with lines about it.
-
-    Args:
-      port: connected; used by this loop only.
-      rate: exchanges per second.
-      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
-      track_taxels: follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured.
-      clock, sleep: replace those of `time`, for simulated time.
     """
 
-    def __init__(
-        self,
-        port: HandPort,
-        sensing: HandSensing,
-        safety: Safety,
-        rate: float,
-        beat: Callable[[float], None] = lambda more: None,
-        *,
-        track_taxels: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
-        self.port, self.sensing, self.safety, self.clock = port, sensing, safety, clock
-        self.pace, self._beat = Pace(rate, clock, sleep), beat
+    port: HandPort  # connected; used by this loop only
+    sensing: HandSensing
+    safety: Safety
+    rate: float  # exchanges per second
+    beat: Callable[[float], None] = lambda more: None
+    """Called before every exchange as a sign of life, with the time s by which the next call may be late."""
+    _: dataclasses.KW_ONLY
+    track_taxels: bool = True
+    """Follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured."""
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+    def __post_init__(self) -> None:
+        self.pace = Pace(self.rate, self.clock, self.sleep)
         self.round_trip = Timing()
-        self.command = passive_command(sensing.hand.num_joints)  # the newest that was sent
+        self.command = passive_command(self.sensing.hand.num_joints)  # the newest that was sent
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
-        self.track_taxels = track_taxels
-        self._filter = VelocityFilter(sensing.hand.num_joints)
+        self._filter = VelocityFilter(self.sensing.hand.num_joints)
         self._generation: int | None = None
         self._engage = False
 
@@ -83,7 +78,7 @@ class ExchangeLoop:
 
     def cycle(self) -> HandSample | None:
         """One exchange; None without an answer. `Safety.problem` tells whether the sample is a measurement."""
-        self._beat(0.0)
+        self.beat(0.0)
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -130,7 +125,7 @@ class ExchangeLoop:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._closed, seconds = True, PATIENCE if self.driven else BRIEF
-        self._beat(seconds)
+        self.beat(seconds)
         try:
             if self.port.turn_off(off, seconds):
                 self.driven = False
@@ -198,7 +193,7 @@ class LoopThread(ExchangeLoop):
             self.close()
 
     def _run(self) -> None:
-        raise_priority()
+        change_priority(EXCHANGE)
         try:
             self.pace.next = self.clock() + self.pace.period
             while not self._stop.is_set():
@@ -209,3 +204,57 @@ class LoopThread(ExchangeLoop):
             self.error = error
         finally:
             self._rest()
+
+
+# --- deadlines --------------------------------------------------------------------------------------
+
+
+class Timing:
+    """Statistics of durations in constant memory."""
+
+    def __init__(self) -> None:
+        self._bins = np.zeros(_BINS + 1, np.int64)
+        self.count, self.missed, self.worst = 0, 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        self._bins[min(int(max(seconds, 0.0) / _BIN), _BINS)] += 1
+        self.count += 1
+        self.worst = max(self.worst, seconds)
+
+    def summary(self) -> dict[str, float]:
+        """Percentiles in ms, number of samples, number of missed deadlines."""
+        ranks = np.searchsorted(np.cumsum(self._bins), self.count * np.array([0.5, 0.99]))
+        p50, p99 = np.minimum((ranks + 1) * _BIN, self.worst).tolist()
+        numbers = {"p50_ms": 1e3 * p50, "p99_ms": 1e3 * p99, "max_ms": 1e3 * self.worst}
+        return {"count": self.count, "missed": self.missed, **numbers}
+
+
+class Pace:
+    """Absolute deadlines `start + k / rate`, rate in Hz, so a slow cycle does not shift the next one."""
+
+    def __init__(
+        self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ):
+        self.period, self._clock, self._sleep = 1.0 / rate, clock, sleep
+        self.jitter = Timing()
+        self.next = clock() + self.period
+
+    def wait(self) -> None:
+        """Sleep until the next deadline. One that passed by at most `GRACE` is kept; older ones are missed."""
+        now = self._clock()
+        # An exchange fills most of its period: skipping a deadline over a fraction of a millisecond costs a whole one.
+        behind = max(math.ceil((now - self.next - GRACE) / self.period), 0)
+        self.jitter.missed += behind
+        self.next += behind * self.period
+        self._sleep(max(self.next - now, 0.0))
+        self.jitter.add(self._clock() - self.next)
+        self.next += self.period
+
+
+def keep_phase(rate: float, other: float) -> float:
+    """`rate` rounded to a multiple of half of `other`, if that changes it by at most 1 %.
+
+    Two loops with such rates keep one or two fixed phases to each other.
+    """
+    near = max(round(2 * rate / other), 1) * other / 2
+    return near if abs(near - rate) <= 0.01 * rate else rate

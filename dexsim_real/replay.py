@@ -184,16 +184,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     run = replay(arguments.log, arguments.hand)
     report, ticks = run.report, len(run.ticks)
-    print(*report["notes"], sep="\n")
-    print(
-        f"{ticks} ticks in {report['seconds']:.2f} s, {report['frames']} frames, {report['damaged_bytes']} damaged "
-        f"bytes, end: {report['ended']}"
-    )
+    read = f"{report['frames']} frames, {report['damaged_bytes']} damaged bytes"
     verdict = "all observations agree to the last bit" if ticks else "nothing could be compared"
     if first := report["first_difference"]:
         verdict = f"{report['observations_same']} of {ticks} observations agree; first difference: {first}"
     if missing := report["without_frame"]:
         verdict += f"; {missing} ticks lack their frame"
+    print(*report["notes"], f"{ticks} ticks in {report['seconds']:.2f} s, {read}, end: {report['ended']}", sep="\n")
     print(verdict)
     if arguments.output:
         cli.write_json(arguments.output, report)

@@ -1,7 +1,5 @@
 """The emulated hand with a policy, in virtual time: true poses, and touch as the bridge measures it."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from dexsim.hand.load import load_hand
@@ -44,12 +42,12 @@ class Emulation:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
         self._run = VirtualRun(plant, self._controller, self._calibration)
-        self._ticks: Iterator[None] = self._run.ticking()
+        self._ticks = self._run.ticking()
         return self.step(values)
 
     def step(self, values: Values) -> Frame:
         self._run.policy.command = values.get("command", 0.5)
-        if next(self._ticks, "over") == "over":
+        if next(self._ticks, None) is None:
             return self.reset(values)
         return self._frame()
 

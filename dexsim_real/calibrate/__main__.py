@@ -20,13 +20,10 @@ from dexsim.calibration.maps import Calibration, save_calibration, torque_consta
 from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.description import Hand
-from dexsim_real.calibrate.bench import Bench, Operator
+from dexsim_real.calibrate.bench import Bench, CalibrateArguments, Operator
 from dexsim_real.calibrate.identify_drives import identify_hand
-from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.plan import placements
-from dexsim_real.calibrate.press_fit import JointFit, fit
-from dexsim_real.calibrate.procedure import PressProcedure
-from dexsim_real.calibrate.read import read_presses
+from dexsim_real.calibrate.press_fit import JointFit, fit, read_presses
+from dexsim_real.calibrate.procedure import PressProcedure, placements
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
@@ -37,8 +34,7 @@ _SPEED = 2.0  # rad/s, largest rate of change of the commands: no motion here ne
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
     """Run the press procedure; returns its log. `bench` replaces port and clock (`Bench`).
 
-    Raises:
-      HandError: the procedure failed; the motors are off.
+    Raises HandError: the procedure failed; the motors are off.
     """
     plan = placements(hand, arguments.fingers, arguments.sides)
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
@@ -54,9 +50,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
         except HandError as error:
             if not pressed:
                 raise
-            raise HandError(
-                f"{error} (the {pressed} presses before are in {work.log.path}; fit them with --from-log)"
-            ) from None
+            raise HandError(f"{error} ({pressed} presses are in {work.log.path}; fit them with --from-log)") from None
         finally:  # A signal that comes just before this line is followed by the close of the bench.
             work.close()
     return work.log.path
@@ -65,17 +59,15 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
     """Fit the presses, print the result, and write the files asked for, the calibration first.
 
-    Raises:
-      DexsimError: the recordings are insufficient, or a file cannot be written.
+    Raises DexsimError: the recordings are insufficient, or a file cannot be written.
     """
     calibration, joints = fit(*read_presses(logs, hand), hand)
     for line in (*table(calibration, joints, hand), *(f"note: {note}" for note in calibration.notes)):
         operator.tell(line)
     output = arguments.destination
     if output.exists() and not arguments.force:  # It may have been created meanwhile.
-        raise HandError(
-            f"{output} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another"
-        )
+        logged = " ".join(map(str, logs))
+        raise HandError(f"{output} already exists: --from-log {logged} fits these presses into another")
     save_calibration(output, calibration)
     operator.tell(f"calibration: {output}")
     if arguments.plot:

@@ -1,31 +1,33 @@
-"""A hand on the bench: the exchange loop of a procedure that moves and measures, and the person beside it."""
+"""A hand on the bench: options, the exchange loop of a procedure that moves and measures, the person beside it, and
+the logs of all that."""
 
 import contextlib
+import dataclasses
 import io
 import re
 import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
-from dexsim.core.config import to_dict
+from dexsim.core.config import Config, from_dict, setting, to_dict
 from dexsim.hand.description import Hand
-from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import smooth
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind, LogWriter
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter, Record, reading
 from dexsim_real.core.process import leave_realtime, use_realtime
-from dexsim_real.loop import ExchangeLoop
-from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire.link import UNCONFIRMED, HandPort
+from dexsim_real.loop import ExchangeLoop, LoopOptions
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire.link import UNCONFIRMED, HandPort, Identity
 from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
@@ -34,13 +36,101 @@ _NEWTONS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
 _LARGEST = 100.0  # N, largest plausible reading
 
 
-class Operator:
-    """The person beside the hand.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PressConfig(Config):
+    """Forces and speeds of a press."""
 
-    Args:
-      out: for output.
-      assume_yes: ask nothing and assume that every answer is yes.
-      stream: of the answers; None is the standard input.
+    peak: float = setting(8.0, unit="N", low=1.0, high=20.0)
+    """Peak force of a press, measured by the taxels; choose it above the forces of the task."""
+    current: float = setting(1.4, unit="A", low=0.01, high=10.0)
+    """Current of a joint above which the press ends before its peak force."""
+    cycles: int = setting(4, unit="1", low=1, high=20)
+    """Number of presses, each with rising and falling force. The first one finds the travel."""
+    seconds: float = setting(6.0, unit="s", low=0.5, high=60.0)
+    """Time from contact to peak force, and back. Long, so that the current shows force and friction only."""
+    first_speed: float = setting(0.06, unit="rad/s", low=0.005, high=1.0)
+    """Speed of the joint targets in the first press."""
+    approach_speed: float = setting(0.15, unit="rad/s", low=0.01, high=2.0)
+    """Speed of the joint targets until contact."""
+    pause: float = setting(0.5, unit="s", low=0.1, high=10.0)
+    """Pause before a measurement."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrateArguments(LoopOptions):
+    """Options of `python -m dexsim_real.calibrate`."""
+
+    port: str | None = None
+    """Serial port of the XHand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION for the driver of
+    another hand (docs/bridge.md). None only with --from-log."""
+    hand: str = ""
+    """The TOML of a hand, or the name of a shipped one (`xhand_left`); empty for the right XHand."""
+    output: Path | None = None
+    """Output file; None for hand.toml, or hand.json with --identify."""
+    force: bool = False
+    """Overwrite an existing output file."""
+    from_log: tuple[Path, ...] = ()
+    """Fit logs of this command again, without a hand. A press in several logs is taken from the last that
+    finished it."""
+    identify: bool = False
+    """Identify the drives instead: move each free joint, and fit stiffness, damping, friction and latency."""
+    gauge: bool = False
+    """Compare the taxels with a kitchen scale or force gauge, whose readings you type. Otherwise the taxels are the
+    reference, as in the paper."""
+    fingers: tuple[str, ...] = ()
+    """Fingers to press; all by default. The other joints get the mean of those with the same torque limit."""
+    sides: bool = True
+    """Also press with the sides of thumb and index finger, to load the joints that spread them."""
+    yes: bool = False
+    """Ask nothing: assume that the fingers always have something to press on."""
+    calibration: Path | None = None
+    """With --identify: calibration file of this hand; None leaves torques unknown."""
+    joints: tuple[str, ...] = ()
+    """With --identify: joints to move; all by default."""
+    dead_band: bool = False
+    """With --identify: also fit the dead band of the drives, which takes minutes per joint."""
+    plot: Path | None = None
+    """Image file for the figure (.png, .pdf or .svg); None draws no figure."""
+    log: Path | None = None
+    """Log file; None for a new file in runs/real."""
+    realtime: bool = True
+    """Request real-time priority; continue without it if not permitted."""
+    press: PressConfig = setting(PressConfig())
+    """Presses."""
+    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15, stall_current=1.8))
+    """Safety limits. Presses hold still at currents that a run need not hold."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if (self.port is None) == (not self.from_log):
+            raise HandError("give --port for a hand, or --from-log FILE for a log of this command")
+        if self.destination.exists() and not self.force:
+            raise HandError(f"{self.destination} already exists: give another --output, or --force to overwrite it")
+        outputs = {"--output": self.destination, "--plot": self.plot, "--log": self.log}
+        inputs = {f"--from-log {path}": path for path in self.from_log}
+        cli.check_no_overwrite(outputs, inputs | {"calibration": self.calibration})
+        if self.gauge and self.yes:
+            raise HandError("--gauge needs answers, but --yes asks nothing; remove one of them")
+        # With another finger or joint than meant the wrong one would move.
+        for name in ("joints", "dead_band") if not self.identify else ("fingers", "gauge", "plot"):
+            if getattr(self, name):
+                word = "not" if self.identify else "only"
+                raise HandError(f"--{name.replace('_', '-')} is {word} for --identify")
+        if self.press.current >= self.safety.current:
+            raise HandError(f"--press.current must be below --safety.current, {self.safety.current:g} A")
+        if self.press.peak >= 0.9 * self.safety.finger_force:
+            raise HandError(f"--press.peak must be well below --safety.finger-force, {self.safety.finger_force:g} N")
+
+    @property
+    def destination(self) -> Path:
+        """Output file."""
+        return self.output or Path("hand.json" if self.identify else "hand.toml")
+
+
+class Operator:
+    """The person beside the hand, who reads `out` and answers on `stream`, by default the standard input.
+
+    With `assume_yes` nothing is asked, and every answer is yes.
     """
 
     def __init__(self, out: TextIO, *, assume_yes: bool = False, stream: TextIO | None = None):
@@ -54,8 +144,7 @@ class Operator:
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.
 
-        Raises:
-          HandError: the input is closed.
+        Raises HandError: the input is closed.
         """
         if self._stream.isatty():
             termios.tcflush(self._stream, termios.TCIFLUSH)  # Discard keys pressed before the question.
@@ -89,8 +178,7 @@ class Operator:
 def parse_reading(text: str) -> float:
     """Newtons from "5.2", "5.2 N", "530 g" or "0.53 kg".
 
-    Raises:
-      HandError: not a number with a known unit, or more than a fingertip can press.
+    Raises HandError: not a number with a known unit, or more than a fingertip can press.
     """
     match = _READING.fullmatch(text.strip())
     if not match:
@@ -110,7 +198,7 @@ class Bench(ExchangeLoop):
     Args:
       task: "calibrate" or "identify", written to the log with the configuration.
       port: replaces the port that the arguments name.
-      clock, sleep: replace those of `time`, for simulated time.
+      clock: `clock` and `sleep` of `ExchangeLoop`, for simulated time.
     """
 
     def __init__(
@@ -121,21 +209,16 @@ class Bench(ExchangeLoop):
         task: str,
         *,
         port: HandPort | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        **clock: Any,
     ):
         self.arguments, self.operator, self._task = arguments, operator, task
-        sensing = HandSensing(hand, arguments.hardware)
-        if port is None:
-            assert arguments.port is not None, "`CalibrateArguments` asks for it"
-            port = open_port(arguments.port, hand, arguments.link)
+        port = port or open_port(str(arguments.port), hand, arguments.link)
         if not arguments.identify and (lacking := [name for name in port.missing if name != "temperatures"]):
-            raise HandError(
-                f"presses need taxels and currents, and the hand has no {' and no '.join(lacking)}: --identify"
-            )
+            raise HandError(f"presses need taxels and currents, and the hand has no {lacking[0]}: --identify")
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log"))
         safety = Safety(hand, arguments.safety, self._react)
-        super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, clock=clock, sleep=sleep)
+        sensing = HandSensing(hand, arguments.hardware)
+        super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, **clock)
         self._newest: dict[str, Any] = {}  # the last exchange, as the log has it
         self._failing_since: float | None = None
         self._connection: int | None = None
@@ -149,18 +232,9 @@ class Bench(ExchangeLoop):
             calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
             for line in self.port.greet(hand, calibration):
                 self._say(line)
-            meta = {
-                "task": self._task,
-                "serial": self.port.identity.serial_number,
-                "handedness": self.port.identity.handedness,
-                "hardware": to_dict(arguments.hardware),
-                "safety": to_dict(arguments.safety),
-                "press": to_dict(arguments.press),
-                "rate": arguments.rate,
-                "clock": time.time(),
-                "environment": cli.environment_report(),
-            }
-            self.log.add(Kind.META, meta)
+            meta = {name: to_dict(getattr(arguments, name)) for name in ("hardware", "safety", "press")}
+            meta |= {"task": self._task, "rate": arguments.rate, "identity": tuple(self.port.identity)}
+            self.log.add(Kind.META, meta | {"clock": time.time(), "environment": cli.environment_report()})
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise
@@ -186,12 +260,10 @@ class Bench(ExchangeLoop):
     def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> HandSample | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
 
-        Args:
-          target: [J] rad, requested joint targets; None keeps the last ones.
-          mark: annotation with which a sample that is not None is logged.
+        `target` [J] rad are the requested joint targets, None keeps the last ones; `mark` is the annotation with which
+        a sample is logged.
 
-        Raises:
-          HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
+        Raises HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
         """
         now = self.clock()
         if target is not None:
@@ -217,8 +289,8 @@ class Bench(ExchangeLoop):
         """The samples of this duration in s; arguments and errors as for `step`, or there is none."""
         until, samples = self.clock() + seconds, list[HandSample]()
         while self.clock() < until:
-            sample = self.step(target, mark)
-            samples += [sample] if sample is not None else []
+            if (sample := self.step(target, mark)) is not None:
+                samples.append(sample)
         if not samples:
             raise HandError(f"no usable answer in {seconds:g} s; check the cable")
         return samples
@@ -226,8 +298,7 @@ class Bench(ExchangeLoop):
     def set_zero(self, samples: list[HandSample]) -> None:
         """Tare the taxels with samples of an untouched hand.
 
-        Raises:
-          HandError: something touches a fingertip, or a taxel is stuck.
+        Raises HandError: something touches a fingertip, or a taxel is stuck.
         """
         if stuck := self.sensing.set_tare([sample.state for sample in samples]):
             raise HandError(f"{'; '.join(stuck)}; power-cycle the hand")
@@ -242,9 +313,8 @@ class Bench(ExchangeLoop):
 
     def move(self, goal: np.ndarray, speed: float = 0.6) -> None:
         """Move to a posture [J] rad; the joint with the longest path has a mean speed of `speed` rad/s."""
-        start = self.safety.commanded  # Not the last reading, which may be wrong.
+        start, begin = self.safety.commanded, self.clock()  # Not the last reading, which may be wrong.
         seconds = max(float(np.abs(goal - start).max()) / speed, 0.3)
-        begin = self.clock()
         while (share := (self.clock() - begin) / seconds) < 1.0:
             self.step(smooth(start, goal, share))
         self.step(goal)
@@ -274,3 +344,38 @@ class Bench(ExchangeLoop):
     def _say(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
         self.operator.tell(text)
+
+
+class Source(NamedTuple):
+    """How logs were recorded, and on which hand."""
+
+    hardware: HardwareConfig
+    rate: float  # Hz
+    identity: Identity
+
+
+def read_logs(paths: Iterable[Path], task: str) -> tuple[Source, list[list[Record]]]:
+    """The source of logs of one hand, task and configuration; of each log the further settings and marked exchanges.
+
+    Raises LogError: a log of another task, hand or configuration than the logs before.
+    """
+    sources, logs = list[Source](), []
+    for path in paths:
+        records = []
+        with reading(path):
+            for record in LogReader(path):
+                content = record.content
+                if record.kind == Kind.META and "task" in content:
+                    if content["task"] != task:
+                        raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
+                    hardware = from_dict(HardwareConfig, content["hardware"])
+                    sources.append(Source(hardware, content["rate"], Identity(*content["identity"])))
+                elif record.kind in (Kind.META, Kind.TICK):
+                    records.append(record)
+        logs.append(records)
+        if len(sources) < len(logs):
+            raise LogError(f"{path}: the log ends before the hand was ready; record again")
+        for what, own, first in zip(("--hardware options", "--rate", "hand"), sources[-1], sources[0], strict=True):
+            if own != first:
+                raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")
+    return sources[0], logs

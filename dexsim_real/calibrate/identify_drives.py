@@ -20,15 +20,13 @@ from dexsim.hand.description import Hand
 from dexsim.identification.excitation import excitation
 from dexsim.identification.identify import Identification, identify
 from dexsim.identification.joint import JointLog
-from dexsim_real.calibrate.bench import Bench, Operator
-from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.read import Source, read_logs
+from dexsim_real.calibrate.bench import Bench, CalibrateArguments, Operator, Source, read_logs
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire import frames
-from dexsim_real.wire.identity import check_identity
+from dexsim_real.wire.link import check_identity
 
 TASK = "identify"
 Marks = list[dict[str, Any]]
@@ -47,8 +45,7 @@ _OFF = 0.05  # share by which the time between two samples may differ from 1 / r
 def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> list[Identification]:
     """Record or read logs, fit each joint, and write the results. A joint that fails leaves those of the others.
 
-    Raises:
-      DexsimError: the hand fails, a log cannot be used, or the data of a joint are insufficient.
+    Raises DexsimError: the hand fails, a log cannot be used, or the data of a joint are insufficient.
     """
     calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
     logs = arguments.from_log or (record(arguments, hand, operator, **bench),)
@@ -59,9 +56,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
         if arguments.joints and name not in arguments.joints:
             continue
         try:
-            log, holdout = (
-                joint_log(name, marks, hand, source, calibration) for marks in (signals["fit"], signals["hold-out"])
-            )
+            log, holdout = (joint_log(name, marks, hand, source, calibration) for marks in signals.values())
             joint = hand.joint_names.index(name)
             start = {
                 "stiffness": STIFFNESS,
@@ -70,13 +65,8 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 "no_load_speed": float(hand.speed_limit[joint]),
                 "inertia": float(model.dof_M0[model.joint(name).dofadr[0]]),  # kg m^2
             }
-            result = identify(
-                log,
-                start,
-                substeps=max(round(log.period / _TIMESTEP), 1),
-                dead_band=(0.0, 0.03) if arguments.dead_band else None,
-                holdout=holdout,
-            )
+            substeps, band = max(round(log.period / _TIMESTEP), 1), (0.0, 0.03) if arguments.dead_band else None
+            result = identify(log, start, substeps=substeps, dead_band=band, holdout=holdout)
         except DexsimError as error:
             failed[name] = error
             operator.tell(f"not identified: {name}: {error}")
@@ -95,8 +85,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
     """Move the joints and record their answers; returns the log.
 
-    Raises:
-      HandError: the procedure failed, or the hand did not answer; the motors are off.
+    Raises HandError: the procedure failed, or the hand did not answer; the motors are off.
     """
     period = 1.0 / arguments.rate
     posture = np.full(hand.num_joints, 0.5)  # rad, about which every joint can move without a collision
@@ -150,8 +139,7 @@ def read_joints(
 def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: Calibration | None) -> JointLog:
     """The samples of a joint in one signal; without a calibration its torques are unknown.
 
-    Raises:
-      LogError: too many exchanges are missing, or they took longer than their period.
+    Raises LogError: too many exchanges are missing, or they took longer than their period.
     """
     joint, period = hand.joint_names.index(name), 1.0 / source.rate
     given = np.array([mark["measured"] for mark in marks], bool)
@@ -161,17 +149,14 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
     time = np.array([mark["sent"] for mark in marks])
     step, missing = np.median(np.diff(time)), time[-1] - time[0] - (len(time) - 1) * period
     if not abs(step - period) <= _OFF * period or not missing <= _LOST * len(time) * period:
-        raise LogError(
-            f"exchanges took {1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing: "
-            "set the latency timer of the adapter to 1 ms, or record again with a lower --rate"
-        )
+        found = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
+        raise LogError(f"exchanges took {found}: set the adapter's latency timer to 1 ms, or lower --rate")
     # Few samples are missing: interpolate them.
     rows = np.arange(len(marks))
     sensing = HandSensing(hand, source.hardware)
     state = np.array([sensing.decode(mark["answer"])["joint"] for mark in marks if mark["measured"]])
     command = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
-    sign, offset = float(sensing.sign[joint]), float(sensing.offset[joint])
-    target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
+    target, position = (sensing.angles(part.astype(float))[:, joint] for part in (command, state["position"]))
     torque = None
     if calibration is not None:
         current = 1e-3 * state["current"].astype(float)  # A

@@ -1,4 +1,4 @@
-"""Fits a calibration to recorded presses: forces and lever arms of the taxels, one robust line per joint and direction.
+"""Reads recorded presses, and fits a calibration: forces and lever arms of the taxels, a line per joint and direction.
 
 The torque that the simulation would report is computed from the same recording: the force of the taxels times its
 lever arm at the measured joint angles (J^T f, with the kinematics of the simulation). The exact place of the contact on
@@ -14,10 +14,11 @@ the motors' temperature.
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, median_filter
+from scipy.ndimage import binary_dilation, correlate, median_filter
 
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
@@ -25,9 +26,11 @@ from dexsim.calibration.maps import Calibration
 from dexsim.calibration.press import MIN_LEVER, contact_jacobian
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.description import Hand
-from dexsim_real.calibrate.procedure import LOADING, RELEASED, TOUCHED, UNLOADING
-from dexsim_real.calibrate.read import Recording, Source
-from dexsim_real.sensors.taxels import around, taxel_names
+from dexsim_real.calibrate.bench import Source, read_logs
+from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING
+from dexsim_real.core.log import Kind, Record
+from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.sensors.taxels import taxel_names
 
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
 _LEVER = 0.002  # m, 95 %, between the contact and the centre of the taxels' forces
@@ -39,12 +42,96 @@ _SHEAR = 0.1  # share of the force above which shear is noted
 _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
 
 _ACTIVE = 2.0  # counts above which a taxel takes part
+_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)  # the neighbours of a taxel
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
 _GAUGE = 0.03  # of the gauge itself, and of how straight it stands under a fingertip that turns by up to 0.25 rad
 _PLACE = 0.08  # between places on a fingertip, whose taxels differ
 _NOMINAL = 0.25  # of the taxels without a gauge
 _OTHERS = 0.35  # of a fingertip without a gauge from those with one
+
+
+@dataclasses.dataclass
+class Recording:
+    """One press; T samples in the order of time."""
+
+    name: str
+    finger: int
+    joints: tuple[int, ...]  # joints that pressed
+    rate: float  # samples per second
+    gauge: dict[str, float]  # N by phase
+    phase: np.ndarray  # [T] str
+    time: np.ndarray  # [T] s
+    counts: np.ndarray  # [T, N] tared, negative ones included
+    shear: np.ndarray  # [T, 2] counts, sums of x and y beyond the rest's
+    current: np.ndarray  # [T, J] A, with the sign of the hand
+    position: np.ndarray  # [T, J] rad
+
+    def at(self, *phases: str) -> np.ndarray:
+        """Mask [T] of the samples of these phases."""
+        return np.isin(self.phase, phases)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the fingertip was freed at the end; otherwise the press was interrupted."""
+        return RELEASED in self.phase
+
+
+def read_presses(paths: Iterable[Path], hand: Hand) -> tuple[Source, dict[str, Recording]]:
+    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that finished it.
+
+    Raises LogError: not a log of presses, or recorded with other settings than the logs before.
+    """
+    source, logs = read_logs(paths, "calibrate")
+    recordings: dict[str, Recording] = {}
+    for records in logs:
+        for press in _presses(source, records, hand):
+            if press.finished or press.name not in recordings:
+                recordings[press.name] = press
+    return source, recordings
+
+
+def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recording]:
+    """The presses of one log; those that were skipped or missed have no samples and are none."""
+    sensing, slant = HandSensing(hand, source.hardware), list[np.ndarray]()
+    presses = dict[str, tuple[dict[str, Any], dict[str, float], list[tuple[Any, ...]]]]()
+    for record in records:
+        content = record.content
+        if "tare" in content:
+            sensing.tare = np.array(content["tare"], np.float32)
+        if "placement" in content:
+            presses[content["placement"]["name"]] = content["placement"], {}, []
+        if record.kind == Kind.META:
+            continue
+        placement, gauge, samples = presses.get(content["press"], ({"finger": 0}, {}, []))
+        if "gauge" in content:
+            gauge[content["phase"]] = float(content["gauge"])
+            continue
+        state, finger = sensing.decode(content["answer"]), placement["finger"]
+        shear = np.stack([state["tip"]["taxel"][axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
+        if content["phase"] == REST:
+            slant.append(shear)
+        counts = sensing.counts(state)[finger].astype(float) - sensing.tare[finger]
+        current, position = 1e-3 * state["joint"]["current"], sensing.angles(state["joint"]["position"]).astype(float)
+        samples.append((content["phase"], record.time, counts, shear[finger], current, position))
+    zero = np.mean(slant, 0) if slant else np.zeros((hand.num_fingers, 2))  # A taxel may read x and y without shear.
+    recordings = []
+    for name, (placement, gauge, samples) in presses.items():
+        if samples:
+            recording = Recording(
+                name,
+                placement["finger"],
+                tuple(placement["joints"]),
+                source.rate,
+                gauge,
+                *(np.array(column) for column in zip(*samples, strict=True)),
+            )
+            recording.shear -= zero[recording.finger]
+            recordings.append(recording)
+    return recordings
+
+
+# --- the fit of each press -------------------------------------------------------------------------
 
 
 class Blocks(NamedTuple):
@@ -79,8 +166,7 @@ class JointFit(NamedTuple):
 def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tuple[Calibration, dict[str, JointFit]]:
     """Fit a calibration to all recorded presses; and what each joint was fitted to, the press with its longest lever.
 
-    Raises:
-      CalibrationError: recordings are missing or unusable.
+    Raises CalibrationError: recordings are missing or unusable.
     """
     blocks, notes = {}, list[str]()
     for name, recording in recordings.items():
@@ -147,25 +233,17 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
         way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
         way[_at_limit(part.current[:, joint], part.run)] = 0
         if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
-            notes.append(
-                f"{label}: hardly moved while the {name} was pressed, held by friction; press on something softer, "
-                "or more often"
-            )
+            notes.append(f"{label}: hardly moved while the {name} was pressed; press on something softer, more often")
             continue
         # A force read too large makes the gain of the current too small, and leaves the lever arm.
         known, placed = float(np.hypot(scale.error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
         real = JointPress(force, part.current[:, joint], way, part.press, known)
         fits[label] = JointFit(name, arm, real, JointPress(force, force * arms[:, joint], way, part.press, placed))
     if dead.any():
-        notes.append(
-            f"{hand.finger_names[finger]}: dead: {taxel_names(hand, dead)} read nothing while their "
-            "neighbours were pressed; the fit uses the mean of the neighbours, a run reads zero"
-        )
+        which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, dead)}"
+        notes.append(f"{which} read nothing while their neighbours were pressed; the fit uses the neighbours' mean")
     if shear > _SHEAR:
-        notes.append(
-            f"{name}: shear of {100 * shear:.0f} % of the force by the taxels' x and y, which the fit "
-            "ignores; press on something that slides, rolls or is soft"
-        )
+        notes.append(f"{name}: shear of {100 * shear:.0f} % of the force, ignored by the fit; press on what rolls")
     if not recording.finished:
         notes.append(f"{name}: was interrupted; the fit has what was pressed until then, press it again")
     elif (left := np.median(recording.counts[recording.at(RELEASED)].sum(-1))) > TOUCHED:
@@ -176,27 +254,25 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
 def make_blocks(recording: Recording, hand: Hand) -> Blocks:
     """Average a recording over blocks of time, but for an incomplete block at the end of a phase.
 
-    Raises:
-      CalibrationError: no phase is long enough.
+    Raises CalibrationError: no phase is long enough.
     """
     size, phase = max(round(_BLOCK * recording.rate), 1), recording.phase
-    cuts = [0, *np.flatnonzero(phase[1:] != phase[:-1]) + 1, len(phase)]
-    names, runs = [], []
-    for first, last in zip(cuts[:-1], cuts[1:], strict=True):
-        starts = range(first, last - size + 1, size)
-        if phase[first] in (LOADING, UNLOADING) and len(starts) > 1:  # A single block has no speed.
-            names.append(phase[first])
-            runs.append(np.array([np.arange(size) + at for at in starts]))
+    runs, presses, before = list[np.ndarray](), list[int](), UNLOADING  # rows [blocks, size] of each, and its press
+    for rows in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
+        blocks = len(rows) // size
+        if phase[rows[0]] in (LOADING, UNLOADING) and blocks > 1:  # A single block has no speed.
+            begins = before == UNLOADING and phase[rows[0]] == LOADING
+            presses.append((presses[-1] if presses else 0) + begins)
+            runs.append(rows[: blocks * size].reshape(blocks, size))
+            before = phase[rows[0]]
     if not runs:
         raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
     time, angle = recording.time, recording.position
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
-    begins = [before == UNLOADING and name == LOADING for before, name in zip([UNLOADING, *names], names, strict=False)]
-    rows, lengths = np.concatenate(runs), [len(run) for run in runs]
     parts = (recording.counts, recording.shear, recording.current, angle)
-    counts, shear, current, position = (part[rows].mean(1) for part in parts)
-    run, press = (np.repeat(number, lengths) for number in (np.arange(len(runs)), np.cumsum(begins)))
+    counts, shear, current, position = (part[np.concatenate(runs)].mean(1) for part in parts)
+    run, press = (np.repeat(number, [len(run) for run in runs]) for number in (range(len(runs)), presses))
     return Blocks(counts * active_taxels(hand, counts), shear, current, position, speed, run, press)
 
 
@@ -210,12 +286,11 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
 
 def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
-    selected = np.zeros(len(current), bool)
-    for number in np.unique(run):
-        size = np.abs(current[run == number])
-        top = size > _TOP * size.max()
-        selected[run == number] = top & (top.sum() >= _TOP_BLOCKS)
-    return selected
+    size, count = np.abs(current), run.max() + 1
+    highest = np.zeros(count)
+    np.maximum.at(highest, run, size)
+    top = size > _TOP * highest[run]
+    return top & (np.bincount(run, top, count) >= _TOP_BLOCKS)[run]
 
 
 def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str, JointFit]) -> np.ndarray:
@@ -254,8 +329,7 @@ def force_scale(
     Returns:
       Newtons of a count [F] for a run, the scale of each press, and notes.
 
-    Raises:
-      CalibrationError: the readings do not rise with the force.
+    Raises CalibrationError: the readings do not rise with the force.
     """
     own, scales, notes = dict[int, float](), dict[str, Scale](), list[str]()  # `own` by finger: N per count
     pressed = sorted(pressed, key=lambda press: not press.name.endswith("pad"))
@@ -286,9 +360,7 @@ def force_scale(
         notes.append(f"no gauge: the taxels' scale is the nominal one, which may be {100 * _NOMINAL:.0f} % off")
     for finger, name in enumerate(hand.finger_names):
         if own and finger not in own:
-            notes.append(
-                f"{name}: not compared with the gauge; has the mean of the others (up to {100 * _OTHERS:.0f} % off)"
-            )
+            notes.append(f"{name}: not compared with the gauge; has the others' mean (up to {100 * _OTHERS:.0f} % off)")
     for press in pressed:
         error = _PLACE if press.finger in own else _OTHERS if own else _NOMINAL
         scales.setdefault(press.name, Scale(float(per_count[press.finger]), 0.0, error))
@@ -303,14 +375,14 @@ def active_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
 
 def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
     """Mask [N] of taxels that read nothing in counts [T, N] of a press, although half of their neighbours did."""
-    largest, ring = counts.max(0).reshape(hand.taxel_grid), np.ones((3, 3), bool)
-    ring[1, 1] = False
-    return ((largest <= 0) & (median_filter(largest, footprint=ring) >= _ACTIVE)).ravel()
+    largest = counts.max(0).reshape(hand.taxel_grid)
+    return ((largest <= 0) & (median_filter(largest, footprint=_RING) >= _ACTIVE)).ravel()
 
 
 def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
     """Counts [T, N] in which a dead taxel has the mean of its working neighbours."""
-    working = (~dead).astype(float)
-    near = around(hand, working[None])[:, 0]  # [8, N]
-    mean = np.sum(around(hand, counts * working), 0) / np.maximum(near.sum(0), 1)
-    return np.where(dead, mean, counts)
+    grid = (-1, *hand.taxel_grid)
+    ring, working = _RING[None].astype(float), np.where(dead, 0.0, 1.0)
+    total = correlate((counts * working).reshape(grid), ring, mode="constant")
+    near = correlate(working.reshape(grid), ring, mode="constant")
+    return np.where(dead, (total / np.maximum(near, 1)).reshape(counts.shape), counts)

@@ -1,4 +1,9 @@
-"""The press procedure: check and tare at rest, then press each fingertip on something firm, slowly.
+"""The presses: their plan, and the procedure that makes them slowly, after a check and a tare at rest.
+
+A press loads the joints with a lever arm at the contact. Targets advance in proportion to these lever arms: joints with
+equal gains then push along the skin's normal, with little shear. The pads load the flexing joints of a finger; the
+joints that spread thumb and index finger are loaded by the sides. A finger presses almost straight: its pad is then
+close to the line through its joints, so a shear force, which the taxels may not show, has a short lever arm.
 
 Samples are logged with their press and phase. `dexsim_real.calibrate.press_fit` reads the log, so an immediate fit and
 a later one give the same result.
@@ -10,8 +15,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dexsim.calibration.press import lever_arms
+from dexsim.hand.description import Hand
+from dexsim.hand.kinematics import flexion_joints
 from dexsim_real.calibrate.bench import Bench
-from dexsim_real.calibrate.plan import Placement
+from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.safety import HandSample, Reaction
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
@@ -20,6 +28,12 @@ LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 """Phases of a press; "level K" is a force held for the gauge."""
 TOUCHED = 20.0
 """Counts that a fingertip's sum may be off zero after a press."""
+
+_OPEN = 0.1  # rad, of the joints that do not press
+_SHARE = 0.3  # of the longest lever arm, above which a joint takes part
+_SPREADS = "index_bend"  # joint of the XHand: other hands are pressed on their pads alone
+_SIDES = {0: "palm's normal", 1: "thumb"}  # its fingers with a joint that spreads them, and where that side faces
+_BENT = (0.3, 0.3, 0.2), (0.35, 0.2)  # rad, joints of the pressing thumb, and of another finger, from the root on
 
 _REST = 2.0  # s, recording with the motors off
 _ANSWERED = 0.5  # share of the samples at rest that must be answered
@@ -34,6 +48,58 @@ _LEAST_MOTION = 0.004  # rad that each joint should move in a press
 _LEAN = (0.5, -0.5, 0.0)  # more motion of the first joints or the last: presses with different shear
 
 
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """One press: a fingertip, and the place on it."""
+
+    name: str  # "index pad"
+    finger: int
+    taxels: tuple[int, ...]  # at the middle of the contact
+    joints: tuple[int, ...]  # joints that press
+    posture: np.ndarray  # [J] rad, at the expected contact
+    direction: np.ndarray  # [J] rad of targets for each rad of advance; the largest is 1
+    task: str  # instruction for the user
+
+
+def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
+    """All presses of these fingers (all by default): pads, the thumb's last; then, if `sides`, the sides of thumb and
+    index finger. HandError: no such finger."""
+    if unknown := sorted(set(fingers) - set(hand.finger_names)):
+        raise HandError(f"no finger {unknown[0]!r}; choose from {', '.join(hand.finger_names)}")
+    selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
+    columns, rows = hand.taxel_grid
+    middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
+    plan = []
+    for finger in sorted(selected, key=lambda i: i == 0):
+        # Bent a little more than the others.
+        name = hand.finger_names[finger]
+        joints = finger_joints(hand, 0) if finger == 0 else flexion_joints(hand, range(finger, finger + 1)).tolist()
+        bent = dict(zip(joints, _BENT[finger > 0], strict=False))
+        task = f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it"
+        plan.append(_placement(hand, f"{name} pad", finger, middle, bent, task))
+    for finger in [i for i in selected if sides and i in _SIDES and _SPREADS in hand.joint_names]:
+        name = hand.finger_names[finger]
+        # The index finger of a left hand has the sensor of a right one: its first columns face the thumb.
+        column = 1 if finger == 1 and hand.side == "left" else columns - 2
+        side = [column * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
+        bent = {0: 0.4} if finger == 0 else {3: -0.1, 4: 0.35, 5: 0.1}
+        task = f"hold the pen across the side of the {name} that faces the {_SIDES[finger]}, 3 mm in front of it"
+        plan.append(_placement(hand, f"{name} side", finger, side, bent, task))
+    return plan
+
+
+def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict[int, float], task: str) -> Placement:
+    """A press at the mean of these taxels; `bent` gives the angles rad of the joints that are not open."""
+    posture = np.where(np.array(hand.joint_names) == _SPREADS, 0.0, _OPEN)
+    posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
+    posture[list(bent)] = list(bent.values())
+    arms = lever_arms(hand, posture, finger, np.isin(np.arange(hand.num_taxels), taxels) / len(taxels))
+    share = arms / np.max(np.abs(arms))
+    direction = np.where(np.abs(share) > _SHARE, share, 0.0)
+    joints = tuple(np.flatnonzero(direction).tolist())
+    return Placement(name, finger, tuple(taxels), joints, posture, direction, task)
+
+
 class MissedPress(HandError):
     """A press that brought nothing and can be made again, such as one beside the pen."""
 
@@ -43,10 +109,8 @@ class PressProcedure:
 
     A press advances the joint targets along a direction in joint space. The direction in which every joint moves
     forward depends on the unpublished stiffness of the drives. It is therefore taken from the press before: the
-    distance by which each joint lagged its target, plus the same small motion for all.
-
-    Args:
-      bench: connected, motors off.
+    distance by which each joint lagged its target, plus the same small motion for all. The bench is connected, with the
+    motors off.
     """
 
     def __init__(self, bench: Bench):
@@ -58,8 +122,7 @@ class PressProcedure:
     def check(self) -> None:
         """Check and tare the taxels, with the motors off and nothing touching them.
 
-        Raises:
-          HandError: too few answers, something touches a fingertip, or a taxel is stuck.
+        Raises HandError: too few answers, something touches a fingertip, or a taxel is stuck.
         """
         self.operator.tell("checking the taxels: do not touch the fingertips")
         samples = self.bench.collect(_REST, mark={"press": "", "phase": REST})
@@ -70,8 +133,7 @@ class PressProcedure:
     def press(self, placement: Placement) -> bool:
         """All presses of one placement, again when they are missed; False when the user skips it.
 
-        Raises:
-          HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
+        Raises HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
         """
         record, attempts = {"placement": dataclasses.asdict(placement)}, 0
         while True:
@@ -134,10 +196,8 @@ class PressProcedure:
                 self._base, self._advance = self._target(), 0.0
                 return
             if self._overloaded(sample):
-                raise MissedPress(
-                    f"{name}: {sample.measured.current.max():.2f} A and no taxel feels it; press on the "
-                    "taxels, and check that their sensor is connected"
-                )
+                current = f"{sample.measured.current.max():.2f} A"
+                raise MissedPress(f"{name}: {current} and no taxel feels it; press on the taxels, check their sensor")
         raise MissedPress(f"{name}: met nothing within {_TRAVEL:g} rad; hold the object closer")
 
     def _load(self, speed: float) -> None:
@@ -157,10 +217,8 @@ class PressProcedure:
             if ended or np.mean(forces[-_LAST:]) - before < _STALL * self.config.peak:
                 break
         if not ended and forces[-1] < 4 * self._touch:
-            raise MissedPress(
-                f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something firmer, or raise "
-                "--hardware.torque-max"
-            )
+            why = f"the force stays at {forces[-1]:.1f} N; press on something firmer, or raise --hardware.torque-max"
+            raise MissedPress(f"{self._placement.name}: {why}")
         self._held = (self._target() - first, np.mean(positions[-_LAST:], 0) - begin)
 
     def _aim(self, lean: float) -> None:
@@ -210,12 +268,9 @@ class PressProcedure:
         self.bench.collect(self.config.pause, self._target())
         name, finger, sensing = self._placement.name, self._placement.finger, self.bench.sensing
         samples = self.bench.collect(self.config.pause, self._target(), {"press": name, "phase": RELEASED})
-        sums = [(sensing.counts(sample.state) - sensing.tare)[finger].sum() for sample in samples]
-        if np.median(sums) < -TOUCHED:
-            raise MissedPress(
-                f"{name}: reads {np.median(sums):.0f} counts after the press: it was touched while it was tared; free "
-                "the fingertip"
-            )
+        left = np.median([(sensing.counts(sample.state) - sensing.tare)[finger].sum() for sample in samples])
+        if left < -TOUCHED:
+            raise MissedPress(f"{name}: reads {left:.0f} counts after the press: it was touched while it was tared")
 
     def _step(self, speed: float, phase: str = "") -> HandSample | None:
         """One exchange, advanced at this speed in rad/s, logged as a sample of the phase unless that is empty.

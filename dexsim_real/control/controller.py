@@ -18,9 +18,9 @@ from dexsim.observation import FIELDS, LayoutEntry, ObservationConfig, Readings,
 from dexsim.task_spec import correct_readings
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.sensors.imu import IDENTITY
-from dexsim_real.sensors.object_sensors import ObjectEstimate
 
 SOURCES = ("hand", "camera", "imu", "user", "policy")
 """Who gives the bridge what a policy observes; see `ObservationField.source`."""
@@ -65,9 +65,7 @@ def sources_of(names: Sequence[str]) -> set[str]:
     """The sensors ("hand", "camera", "imu", ...) for these observation fields. HandError: none measures one of them."""
     for name in names:
         if name not in FIELDS or FIELDS[name].source not in SOURCES:
-            raise HandError(
-                f"the policy observes {name!r:.80}, which no sensor measures on hardware; use a policy without it"
-            )
+            raise HandError(f"the policy observes {name!r:.80}, which no sensor measures on hardware")
     return {FIELDS[name].source for name in names}
 
 
@@ -119,10 +117,8 @@ class Controller:
             wanted["corrects its command by the measured force"] = NEEDS["finger_force"]
         for what, needs in wanted.items():
             if lacking := [need for need in needs if need in missing]:
-                raise HandError(
-                    f"the policy {what}, and the hand has no {' and no '.join(lacking)}; train one without it "
-                    "(--env.observation.leave-out, --env.control.force.gain 0)"
-                )
+                options = "--env.observation.leave-out, --env.control.force.gain 0"
+                raise HandError(f"the policy {what}, and the hand has no {lacking[0]}; train without it ({options})")
 
     def start(self, target: np.ndarray) -> None:
         """Begin an episode with these joint targets [J] rad and no previous action."""

@@ -14,8 +14,8 @@ from dexsim_real.control.controller import Controller, Tick
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.camera import ObjectEstimate, ObjectSensors
 from dexsim_real.sensors.imu import IDENTITY, conjugate, multiply
-from dexsim_real.sensors.object_sensors import ObjectEstimate, ObjectSensors
 
 _PATIENCE = 60.0  # s to wait until the camera sees the object
 _SMOOTH = 0.1  # s, of the object's angular velocity
@@ -66,35 +66,25 @@ def limits_for(config: SafetyConfig, controller: Controller) -> SafetyConfig:
     return dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * controller.period))
 
 
+@dataclasses.dataclass(eq=False)
 class PolicyLoop:
-    """Sets the joint targets of a run.
+    """Sets the joint targets of a run."""
 
-    Args:
-      controller: of the policy, warmed.
-      command: grip command in [0, 1].
-      approach: s to move to the start posture; 0 stays at the measured pose.
-      place: s in the start posture.
-      motors_off: compute everything for a hand that is moved by somebody.
-    """
+    controller: Controller  # of the policy, warmed
+    safety: Safety
+    objects: ObjectSensors
+    _: dataclasses.KW_ONLY
+    command: float  # grip command in [0, 1]
+    approach_seconds: float  # to move to the start posture; 0 stays at the measured pose
+    place_seconds: float  # in the start posture
+    motors_off: bool = False  # compute everything for a hand that is moved by somebody
 
-    def __init__(
-        self,
-        controller: Controller,
-        safety: Safety,
-        objects: ObjectSensors,
-        *,
-        command: float,
-        approach: float,
-        place: float,
-        motors_off: bool = False,
-    ):
-        self.controller, self.safety, self.objects, self.command = controller, safety, objects, command
-        spec = controller.spec
+    def __post_init__(self) -> None:
+        spec = self.controller.spec
         self.goals: TurnGoals | None = None
-        if spec.turn and objects.imu:
+        if spec.turn and self.objects.imu:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
-        self.ticks, self.finger_force = 0, np.zeros(controller.hand.num_fingers)  # number; N, sum over the ticks
-        self._approach, self._place, self._motors_off = approach, place, motors_off
+        self.ticks, self.finger_force = 0, np.zeros(self.controller.hand.num_fingers)  # number; N, sum over the ticks
         self.sample: HandSample  # that the newest tick saw
         self._begin: float | None = None  # s, of the approach
         self._anchor = 0
@@ -107,17 +97,14 @@ class PolicyLoop:
         if self._begin is None:
             # Where commands continue, not the last reading, which may be wrong.
             self._begin, self._start = now, self.safety.commanded
-        ready = self._begin + self._approach + self._place
+        ready = self._begin + self.approach_seconds + self.place_seconds
         if now >= ready and self.objects.ready():
             return False
         if now > ready + _PATIENCE:
-            raise HandError(
-                "the camera does not see the object; check the light, the colour thresholds "
-                "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
-            )
-        posture = self.controller.spec.posture if self._approach > 0 else None
+            raise HandError("the camera does not see the object; check light, --optics.hsv-low, -high and .min-area")
+        posture = self.controller.spec.posture if self.approach_seconds > 0 else None
         goal = self._start if posture is None else np.asarray(posture, np.float32)
-        share = min((now - self._begin) / self._approach, 1.0) if self._approach > 0 else 1.0
+        share = min((now - self._begin) / self.approach_seconds, 1.0) if self.approach_seconds > 0 else 1.0
         self.safety.set_target(smooth(self._start, goal, share), now)
         return True
 
@@ -135,7 +122,7 @@ class PolicyLoop:
         if self._anchor != safety.anchor:
             self._anchor = safety.anchor
             self.controller.resume(safety.commanded)
-        if self._motors_off:
+        if self.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         estimate, when = self.objects.read(now)
         goal = self.goals.update(when, estimate) if self.goals else IDENTITY

@@ -173,8 +173,9 @@ class Safety:
         """The command for this cycle."""
         if not self.engaged or self.latched or self.sample is None:
             return self._finish(now, Reaction.RELAX, self.latched or "not engaged", self._rest())
-        sample = self.sample
-        fatal = self._fatal()
+        sample, fatal = self.sample, self._alarms.fatal
+        if self.problem and self._wrong.seconds > self.config.patience:
+            fatal = f"implausible measurements for {self.config.patience:g} s: {self.problem}"
         if fatal:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
@@ -200,11 +201,6 @@ class Safety:
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if request is None else request.position)
-
-    def _fatal(self) -> str:
-        if self.problem and self._wrong.seconds > self.config.patience:
-            return f"implausible measurements for {self.config.patience:g} s: {self.problem}"
-        return self._alarms.fatal
 
     def _silence(self) -> str:
         return f"{_SILENT}: {self.refused}" if self.refused else _SILENT

@@ -26,8 +26,7 @@ class HandError(DexsimError):
 def open_serial(port: str, baud: int, **options: Any) -> Any:
     """The serial port at a device, by-id link, pseudo-terminal or pyserial URL, for nobody else meanwhile.
 
-    Raises:
-      HandError: it cannot be opened, or pyserial is missing.
+    Raises HandError: it cannot be opened, or pyserial is missing.
     """
     try:
         import serial
@@ -58,8 +57,7 @@ def explain(port: str, error: Exception) -> str:
 def find_function(name: str, given: str, form: str, default: str = "") -> Callable[..., Any]:
     """The user's function MODULE:FUNCTION, or `default` of MODULE; `given` is the option, `form` what to give.
 
-    Raises:
-      HandError: no such module or function, or the module fails when it is imported.
+    Raises HandError: no such module or function, or the module fails when it is imported.
     """
     module, _, function = name.partition(":")
     try:

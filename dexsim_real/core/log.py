@@ -23,7 +23,7 @@ import msgpack
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim_real.core.process import lower_priority
+from dexsim_real.core.process import BACKGROUND, change_priority
 
 MAGIC = b"DXSLOG2\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
@@ -64,8 +64,7 @@ class LogWriter:
 
     A full disk ends the log, not the run: `failure` has the reason and `dropped` counts the lost records.
 
-    Raises:
-      LogError: the file cannot be created, or exists.
+    Raises LogError: the file cannot be created, or exists.
     """
 
     def __init__(self, path: str | Path):
@@ -111,7 +110,7 @@ class LogWriter:
             os.close(self._file)
 
     def _run(self) -> None:
-        lower_priority()
+        change_priority(BACKGROUND)
         synced = time.monotonic()
         while True:
             last = self._stop.wait(_WAIT)
@@ -148,8 +147,7 @@ def encode(kind: Kind, when: float, content: Any) -> bytes:
 class LogReader:
     """Iterates over the intact records of a log; `damaged` counts the bytes skipped so far.
 
-    Raises:
-      LogError: the file is missing, is not a log, or has more false heads than damage explains.
+    Raises LogError: the file is missing, is not a log, or has more false heads than damage explains.
     """
 
     def __init__(self, path: str | Path):
@@ -183,8 +181,7 @@ class LogReader:
 def reading(path: str | Path) -> Iterator[None]:
     """Turn the error of a reader about a record of unexpected content into one line.
 
-    Raises:
-      LogError: there is such a record.
+    Raises LogError: there is such a record.
     """
     try:
         yield

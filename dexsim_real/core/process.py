@@ -10,8 +10,9 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
+EXCHANGE, BACKGROUND = 5, -5
+"""Priority of the exchange thread, and of threads that wait for disk, terminal or camera, relative to the others'."""
 _PRIORITY = 20
-_STEP = 5
 _UNSUPPORTED = (OSError, AttributeError)  # not permitted; no such scheduler on this system
 
 
@@ -33,17 +34,8 @@ def leave_realtime() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def raise_priority() -> None:
-    """Run this thread before the bridge's others. No effect without real-time priority."""
-    _change_priority(_STEP)
-
-
-def lower_priority() -> None:
-    """Run this thread after the bridge's others. No effect without real-time priority."""
-    _change_priority(-_STEP)
-
-
-def _change_priority(by: int) -> None:
+def change_priority(by: int) -> None:
+    """Run this thread before the bridge's others (`EXCHANGE`) or after them. No effect without real-time priority."""
     with contextlib.suppress(*_UNSUPPORTED):  # A priority above that of `use_realtime` may be refused.
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))

@@ -13,8 +13,7 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim_real.core.process import stopping
-from dexsim_real.run.options import RunArguments
-from dexsim_real.run.session import execute
+from dexsim_real.run.session import RunArguments, execute
 from dexsim_real.run.status import show_summary
 
 

@@ -7,19 +7,21 @@ import contextlib
 import dataclasses
 import gc
 import hashlib
+import math
 import sys
 import termios
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
+import tyro
 
 from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
-from dexsim.core.config import to_dict
+from dexsim.core.config import setting, to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, Tick, prepare_jax
@@ -28,15 +30,12 @@ from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
-from dexsim_real.core.timing import Pace, Timing, keep_phase
-from dexsim_real.loop import LoopThread
+from dexsim_real.loop import LoopOptions, LoopThread, Pace, keep_phase
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.options import RunArguments
 from dexsim_real.run.status import HandState, StatusView
-from dexsim_real.sensors.camera import HeightSensor, open_masks
+from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.imu import Imu
-from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.sensors.imu import UPRIGHT_X, Imu
 from dexsim_real.wire.link import UNCONFIRMED
 from dexsim_real.wire.serial_hand import open_port
 
@@ -48,6 +47,63 @@ _QUESTION = (
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 _BLIND = 0.1  # share of the time without a measurement that a run may have, such as a cable that was out for a moment
 _HELD = 0.5  # share of the time in which `Safety` may have held the hand
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunArguments(LoopOptions):
+    """Options of `python -m dexsim_real.run`."""
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """Policy file, or name of a shipped policy ("grasp")."""
+    port: str
+    """Serial port of the XHand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION for the driver of
+    another hand (docs/bridge.md)."""
+    hand: str = ""
+    """The TOML of a hand of your own, where it is not in the place that the policy's file names."""
+    command: float = setting(0.5, unit="1", low=0.0, high=1.0)
+    """Grip command in [0, 1]."""
+    seconds: float = setting(30.0, unit="s", low=0.1, high=86400.0)
+    """Duration of the run, after the approach."""
+    motors_off: bool = False
+    """Measure, compute and display everything with the motors off."""
+    yes: bool = False
+    """Do not ask before the motors come on (for scripts and the emulated hand)."""
+    calibration: Path | None = None
+    """Calibration file of this hand; None only with --uncalibrated."""
+    uncalibrated: bool = False
+    """Run without a calibration, on default scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
+    imu: str | None = None
+    """Serial port of the IMU in the object; None if the policy needs no IMU."""
+    imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
+    """Orientation (w, x, y, z) of the IMU in the object; by default its z is along the object's x."""
+    camera: str | None = None
+    """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION. None if the policy needs
+    no camera."""
+    fixed_object: bool = False
+    """Run without a camera: assume that the object stays at its nominal position."""
+    guard: bool = True
+    """Start a second process that turns the motors off when this one dies or freezes."""
+    approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
+    """Time to move from the measured pose to the task's start posture; 0 stays at the measured pose."""
+    place: float = setting(0.0, unit="s", low=0.0, high=600.0)
+    """Time in the start posture to put the object into the hand, aligned with the palm if the IMU is used."""
+    log: Path | None = None
+    """Log file; None for a new file in runs/real."""
+    output: Path | None = None
+    """JSON file for the summary; None writes no file."""
+    realtime: bool = True
+    """Request real-time priority; continue without it if not permitted."""
+    quiet: bool = False
+    """Hide the live status."""
+    optics: CameraConfig = setting(CameraConfig())
+    """Pose of the camera, and colour of the object."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if math.hypot(*self.imu_mount) < 1e-3:
+            raise HandError(f"--imu-mount {' '.join(f'{v:g}' for v in self.imu_mount)}: is no orientation (w, x, y, z)")
+        if (self.calibration is None) != self.uncalibrated:
+            raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +147,9 @@ def run_policy(
 
 def execute(arguments: RunArguments) -> RunResult:
     """Run with these options, within `stopping`; see `run_policy`."""
-    if not (arguments.yes or arguments.motors_off):
-        check_terminal()
+    asks = not (arguments.yes or arguments.motors_off)
+    if asks and not all(stream and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+        raise HandError("cannot ask for confirmation without a terminal; give --yes or --motors-off")
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)
@@ -162,8 +219,7 @@ class Outcome:
 class Session:
     """A run: the constructor opens only files, `prepare` connects with the motors off, `run` turns them on.
 
-    Raises:
-      DexsimError: the policy, calibration or log cannot be used.
+    Raises DexsimError: the policy, calibration or log cannot be used.
     """
 
     def __init__(self, arguments: RunArguments):
@@ -189,7 +245,7 @@ class Session:
         self.loop.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
         self.policy: PolicyLoop | None = None  # from `prepare` on
-        self.compute, self.pace = Timing(), Pace(policy.control_rate)
+        self.pace = Pace(policy.control_rate)
         self.started = 0.0
         self.outcome = Outcome()
         self.newest: Tick | None = None
@@ -200,8 +256,7 @@ class Session:
     def prepare(self) -> None:
         """Connect with the motors off, tare the taxels, start camera and IMU.
 
-        Raises:
-          HandError: something is missing or does not answer.
+        Raises HandError: something is missing or does not answer.
         """
         arguments, sensing = self.arguments, self.sensing
         for line in self.port.greet(sensing.hand, sensing.calibration):
@@ -216,16 +271,15 @@ class Session:
             self.safety,
             open_objects(arguments, self.controller),
             command=arguments.command,
-            approach=arguments.approach,
-            place=arguments.place,
+            approach_seconds=arguments.approach,
+            place_seconds=arguments.place,
             motors_off=arguments.motors_off,
         )
 
     def run(self) -> None:
         """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
 
-        Raises:
-          HandError: the answer was not yes, or `Safety` or a failure ended the run.
+        Raises HandError: the answer was not yes, or `Safety` or a failure ended the run.
         """
         assert self.policy is not None, "`prepare` comes first"
         if not (self.arguments.yes or self.arguments.motors_off):
@@ -285,7 +339,6 @@ class Session:
             "safety": dict(safety.counts),
             "mean_finger_force": float(policy.finger_force.sum() / max(policy.ticks, 1)) if policy else 0.0,
             "policy_jitter": self.pace.jitter.summary(),
-            "policy_compute": self.compute.summary(),
             "exchange_jitter": loop.pace.jitter.summary(),
             "round_trip": loop.round_trip.summary(),
             "link": dataclasses.asdict(self.port.counts),
@@ -346,7 +399,6 @@ class Session:
                 fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
                 fields |= {"sequence": policy.sample.sequence, "age": now - policy.sample.time}
                 self.log.add(Kind.TICK, fields | {"readings": vars(tick.readings)}, now)
-                self.compute.add(time.monotonic() - now)
             self.pace.wait()
         self._check()
 
@@ -392,12 +444,6 @@ class Session:
         )
 
 
-def check_terminal() -> None:
-    """Raises HandError: nobody can be asked, since input or error output is no terminal."""
-    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
-        raise HandError("cannot ask for confirmation without a terminal; give --yes or --motors-off")
-
-
 def ask() -> None:
     """Ask on the terminal whether the motors may come on. Raises HandError: the answer is not yes."""
     with contextlib.suppress(OSError, ValueError, termios.error):
@@ -410,8 +456,7 @@ def ask() -> None:
 def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSensors:
     """Open the camera and the IMU of a run.
 
-    Raises:
-      HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
+    Raises HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
     """
     spec, needed = controller.spec, controller.sources
     if "imu" in needed and not arguments.imu:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexsim.hand.description import Hand
-from dexsim_real.core.process import lower_priority
+from dexsim_real.core.process import BACKGROUND, change_priority
 from dexsim_real.sensors.hand import HandMeasurement
 
 _LIVE = 0.25  # s between two updates of the tables
@@ -95,7 +95,7 @@ class StatusView:
                 self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
 
     def _run(self) -> None:
-        lower_priority()
+        change_priority(BACKGROUND)
         while not self._stop.wait(_LIVE):
             self._print_notes()
             if self._live:

@@ -1,4 +1,4 @@
-"""The object's height from a camera: segmentation mask, centroid, ray, height.
+"""Sensors of the object: its height from a camera, by segmentation mask, centroid and ray; its orientation from an IMU.
 
 As in the paper, the object's other coordinates are taken as fixed. The height is that of the point on the measured
 axis that is nearest to the centroid's ray. `Masks` is any callable; built in are a colour threshold (OpenCV) and a
@@ -11,13 +11,15 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError, find_function
-from dexsim_real.core.process import lower_priority
+from dexsim_real.core.process import BACKGROUND, change_priority
+from dexsim_real.sensors.imu import IDENTITY, ImuReader
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
 """Blocks until the next picture; returns its time (s, monotonic clock) and a bool mask [H, W], or None at the end.
@@ -94,9 +96,7 @@ class HeightSensor:
         self, masks: Masks, config: CameraConfig, reference: np.ndarray, axes: tuple[bool, bool, bool], weight: float
     ):
         if sum(axes) != 1:
-            raise HandError(
-                f"the policy observes the object's coordinates {axes}; one camera measures one: use another policy"
-            )
+            raise HandError(f"the policy observes the object's coordinates {axes}, and a camera measures one")
         self._masks, self._config, self._weight = masks, config, weight
         self._reference, self._axis = np.asarray(reference, float), axes.index(True)
         self._newest: tuple[float, np.ndarray, np.ndarray] | None = None
@@ -135,7 +135,7 @@ class HeightSensor:
         self._thread.join(1.0)
 
     def _run(self) -> None:
-        lower_priority()
+        change_priority(BACKGROUND)
         while not self._stop.is_set():
             try:
                 picture = self._masks()
@@ -148,6 +148,56 @@ class HeightSensor:
             except Exception as error:  # Also of the user's function.
                 self.failure = f"the camera failed: {' '.join(str(error).split()) or type(error).__name__:.200}"
                 return
+
+
+class ObjectEstimate(NamedTuple):
+    """Pose and velocity of the object, palm frame."""
+
+    position: np.ndarray  # [3] m
+    velocity: np.ndarray  # [3] m/s
+    quat: np.ndarray  # [4] (w, x, y, z)
+    palm_gravity: np.ndarray = np.zeros(3)  # [3]; zeros without an IMU
+
+
+class ObjectSensors:
+    """Camera and IMU, None without one. What neither measures is fixed: `reference` [3] m is the nominal position."""
+
+    def __init__(self, reference: np.ndarray, camera: HeightSensor | None = None, imu: ImuReader | None = None):
+        self._reference, self.camera, self.imu = np.asarray(reference, float), camera, imu
+
+    def ready(self) -> bool:
+        """Whether the camera sees the object; if so, its current orientation becomes the identity.
+
+        Raises HandError: no picture will come any more.
+        """
+        if self.camera and not self.camera.has_measurement:
+            if self.camera.failure:
+                raise HandError(self.camera.failure)
+            return False
+        if self.imu:
+            self.imu.calibrate(IDENTITY)
+        return True
+
+    def read(self, now: float) -> tuple[ObjectEstimate, float]:
+        """The estimate, and the time in s of the newest orientation."""
+        position, velocity = self.camera.read()[1:] if self.camera else (self._reference, np.zeros(3))
+        if not self.imu:
+            return ObjectEstimate(position, velocity, IDENTITY), now
+        when, quat = self.imu.read()
+        return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
+
+    def lost(self, now: float, limit: float) -> str:
+        """Why a measurement is older than `limit` s, or its sensor is not to be trusted; empty if all is well."""
+        if self.camera and now - self.camera.read()[0] > limit:
+            return self.camera.failure or "the object is out of sight"
+        if self.imu and self.imu.jumped:
+            return "the orientation that the IMU sends has jumped"
+        return "the IMU is silent" if self.imu and now - self.imu.read()[0] > limit else ""
+
+    def close(self) -> None:
+        for sensor in (self.camera, self.imu):
+            if sensor:
+                sensor.close()
 
 
 # --- sources of masks ----------------------------------------------------------------------------
@@ -164,16 +214,15 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
         return _stream(spec.removeprefix("unix:"))
     if ":" in spec and not spec.startswith(("/", "rtsp:", "http")):
         return _camera("0", find_function(spec, spec, "MODULE:FUNCTION of an importable module"))
-    return _camera(spec, lambda picture: colour_mask(picture, config))
 
+    def colour_mask(picture: np.ndarray) -> np.ndarray:
+        import cv2
 
-def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
-    """Mask [H, W] of the pixels of a BGR picture within the colour thresholds, single pixels removed."""
-    import cv2
+        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+        mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
+        return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0  # Without single pixels.
 
-    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-    mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
-    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return _camera(spec, colour_mask)
 
 
 def encode_mask(when: float, mask: np.ndarray) -> bytes:

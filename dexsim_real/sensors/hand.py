@@ -98,10 +98,9 @@ class HandSensing:
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         self.hand, self.config, self.calibration = hand, config, calibration
-        self.sign, self.offset = (
-            config.per_joint(name, hand.num_joints).astype(np.float32) for name in ("joint_sign", "joint_offset")
-        )
-        self._gains = {name: config.per_joint(name, hand.num_joints) for name in ("kp", "ki", "kd")}
+        names, joints = ("joint_sign", "joint_offset", "kp", "ki", "kd"), hand.num_joints
+        sign, offset, *self._gains = (config.per_joint(name, joints) for name in names)
+        self._sign, self._offset = sign.astype(np.float32), offset.astype(np.float32)
         self.tare = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._tared, self._advised = self.tare, np.zeros(hand.num_fingers, bool)
         self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
@@ -123,9 +122,7 @@ class HandSensing:
         for block in (self.block, frames.STATE_BLOCK):
             if len(data) == block.itemsize:
                 return frames.decode_state(data, block)
-        raise HandError(
-            f"expected states of {self.hand.name}, got one of {len(data)} bytes: give the log's hand with --hand"
-        )
+        raise HandError(f"expected states of {self.hand.name}, got {len(data)} bytes: give the log's hand with --hand")
 
     def measure(self, state: np.ndarray) -> HandMeasurement:
         """A `frames.STATE_BLOCK` or `frames.driver_block` in SI units."""
@@ -135,7 +132,7 @@ class HandSensing:
         board, palm = joint["temperature"] & 0xFF, joint["temperature"] >> 8
         current = joint["current"].astype(np.float32)
         return HandMeasurement(
-            joint_position=joint["position"] * self.sign + self.offset,
+            joint_position=self.angles(joint["position"]),
             joint_torque=np.nan_to_num(np.asarray(self._torque(current), np.float32)),
             taxel_force=counts * self._per_count,
             current=np.abs(current) * np.float32(1e-3),
@@ -143,6 +140,10 @@ class HandSensing:
             errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
             mode=(joint["raw_position"] & 0xF).astype(np.uint8),
         )
+
+    def angles(self, reported: np.ndarray) -> np.ndarray:
+        """Angles [..., J] rad of the model, given those that the hand counts."""
+        return reported * self._sign + self._offset
 
     def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:
         """Tare the taxels: their mean counts over these states of an untouched hand read as no force.
@@ -195,14 +196,10 @@ class HandSensing:
         Gains are 0 in all modes but `POSITION`. `stiffness` is a share of the gains kp and ki in [0, 1]; those of
         damping are always whole. Raises HandError: an angle is not finite.
         """
-        on, gains = mode == Mode.POSITION, self._gains
+        on, (kp, ki, kd), current = mode == Mode.POSITION, self._gains, self.config.torque_max
+        reported, share = (np.asarray(position) - self._offset) * self._sign, stiffness * on
         block = frames.command_block(
-            (np.asarray(position) - self.offset) * self.sign,
-            kp=gains["kp"] * stiffness * on,
-            ki=gains["ki"] * stiffness * on,
-            kd=gains["kd"] * on,
-            torque_max=self.config.torque_max * on,
-            mode=mode,
+            reported, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on, mode=mode
         )
         if not np.isfinite(block["position"]).all():
             raise HandError("a command is not finite; it was not sent")

@@ -15,6 +15,7 @@ import time
 import numpy as np
 
 from dexsim_real.core.errors import HandError, open_serial
+from dexsim_real.core.stream import FrameParser
 
 HEAD = b"\xaa\xaa"
 SIZE = 19
@@ -62,26 +63,9 @@ def decode(frame: bytes) -> np.ndarray | None:
     )
 
 
-class RvcParser:
-    """Extracts index and orientation of the frames in a stream of bytes; damaged ones are counted and skipped."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.damaged = 0
-
-    def feed(self, data: bytes) -> list[tuple[int, np.ndarray]]:
-        self._buffer += data
-        buffer, quats, done = self._buffer, [], 0
-        while (at := buffer.find(HEAD, done)) >= 0 and at + SIZE <= len(buffer):
-            quat = decode(bytes(buffer[at : at + SIZE]))
-            if quat is None:
-                self.damaged += 1
-            else:
-                quats.append((buffer[at + len(HEAD)], quat))
-            done = at + (SIZE if quat is not None else 1)
-        # The last byte may be the first half of a head, unless it ends a frame.
-        del buffer[: at if at >= 0 else max(done, len(buffer) - 1)]
-        return quats
+def make_parser() -> FrameParser[tuple[int, np.ndarray]]:
+    """Finds the frames in a stream of bytes: their index and orientation."""
+    return FrameParser(HEAD, SIZE, len, lambda frame: None if (quat := decode(frame)) is None else (frame[2], quat))
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -109,7 +93,7 @@ class ImuReader:
     """
 
     def __init__(self, mount: tuple[float, ...] = UPRIGHT_X, port: str = "IMU"):
-        self.port, self.parser = port, RvcParser()
+        self.port, self.parser = port, make_parser()
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
@@ -158,11 +142,7 @@ class ImuReader:
 
 
 class Imu(ImuReader):
-    """Reads the IMU at a serial port from its own thread.
-
-    Raises:
-      HandError: the port cannot be opened.
-    """
+    """Reads the IMU at a serial port from its own thread. HandError: the port cannot be opened."""
 
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
         super().__init__(mount, port)
@@ -176,9 +156,7 @@ class Imu(ImuReader):
         until = time.monotonic() + seconds
         while self._newest is None:
             if time.monotonic() > until:
-                raise HandError(
-                    f"{self.port}: the IMU sends no orientation; set it to UART-RVC mode (PS0 high, PS1 low)"
-                )
+                raise HandError(f"{self.port}: no orientation; set the IMU to UART-RVC mode (PS0 high, PS1 low)")
             time.sleep(0.005)
 
     def close(self) -> None:

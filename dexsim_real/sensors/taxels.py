@@ -34,16 +34,12 @@ def judge_rest(hand: Hand, counts: np.ndarray, most: float) -> np.ndarray:
     for finger, name in enumerate(hand.finger_names):
         patch = high[finger] & (beside[finger] > 0)
         if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
-            raise HandError(
-                f"cannot tare the taxels: {patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts: "
-                "something touches it; free the fingertips"
-            )
+            what = f"{patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts"
+            raise HandError(f"cannot tare the taxels: {what}: something touches it; free the fingertips")
         if total[finger] > most:
-            raise HandError(
-                f"cannot tare the taxels: those of the {name} read {total[finger]:.0f} counts together, limit "
-                f"{most:.0f}: something touches it; free the fingertips, or power-cycle the hand. If they read as much "
-                "untouched, raise --hardware.tare-sum"
-            )
+            what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
+            todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
+            raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
         if high[finger].sum() > _MANY:
             which = taxel_names(hand, high[finger])
             raise HandError(f"{name}: {high[finger].sum()} taxels are stuck: {which}; power-cycle the hand")

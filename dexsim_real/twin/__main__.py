@@ -8,6 +8,8 @@ millisecond and follows the wall clock. On a slow machine simulated time slips; 
 """
 
 import dataclasses
+import functools
+import math
 import select
 import shlex
 import signal
@@ -27,11 +29,12 @@ from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
-from dexsim_real.twin.wire.firmware import SERIALS, Firmware
-from dexsim_real.twin.wire.line import HandLine, Terminal
+from dexsim_real.twin.wire.firmware import SERIALS, Firmware, HandLine, Terminal
 from dexsim_real.wire.serial_hand import check_wire
 
 _BUSY = 0.002  # s, longest that a slice of the physics or a picture takes
+SLICE = 0.001  # s, simulated at once
+MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,62 +67,21 @@ class TwinArguments(Config):
     own."""
 
 
-class PlantClock:
-    """Keeps the time of a plant at the wall clock.
-
-    Args:
-      plant: the physics.
-      start: s, wall clock at the start of the plant; `now` is its current time.
-      note: called with one line when simulated time slips.
-    """
-
-    SLICE = 0.001  # s, simulated at once
-    MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
-
-    def __init__(self, plant: EmulatedHand, start: float, note: Callable[[str], None]):
-        self.plant, self.now, self._note = plant, start, note
-        self.slipped = 0.0  # s
-        self._noted_at = -1e9
-
-    def catch_up(self, now: float, limit: float = 0.01) -> None:
-        """Advance the plant to a time in s, by at most `limit` s."""
-        lag = now - self.now
-        if lag > self.MAX_LAG:
-            self.now += lag - limit
-            self.slipped += lag - limit
-            if now > self._noted_at + 5.0:
-                self._noted_at = now
-                self._note(f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far")
-        step = min(now - self.now, limit)
-        if step > 0:
-            self.plant.advance(step)
-            self.now += step
-
-
 class Twin:
     """An emulated hand with its ports, in a folder; `show` is called with one line for every event.
 
-    Raises:
-      HandError: a port or socket cannot be created.
+    Raises HandError: a port or socket cannot be created.
     """
 
-    def __init__(
-        self,
-        arguments: TwinArguments,
-        plant: EmulatedHand,
-        folder: Path,
-        show: Callable[[str], None] = lambda text: None,
-    ):
+    def __init__(self, arguments: TwinArguments, plant: EmulatedHand, folder: Path, show: Callable[[str], None]):
         self.arguments, self.plant, self._show = arguments, plant, show
-        self.start, seed = time.monotonic(), arguments.seed
-        self.clock = PlantClock(plant, self.start, self.note)
-        terminal, firmware = Terminal(folder / "hand"), Firmware(plant, self.note)
-        self.line = HandLine(terminal, firmware, seed=seed, catch_up=self.clock.catch_up)
+        self.start = self.now = time.monotonic()  # s; the plant's time by the wall clock
+        self.slipped, self._noted_at = 0.0, -math.inf  # s
+        terminal = Terminal(folder / "hand")
+        self.line = HandLine(terminal, Firmware(plant, self.note), self.catch_up, arguments.seed)
         try:
-            if arguments.task == "grasp":
-                self.sensor: EmulatedImu | EmulatedCamera = EmulatedCamera(folder / "masks", plant, seed, self.start)
-            else:
-                self.sensor = EmulatedImu(folder / "imu", plant, seed, self.start)
+            kind, name = (EmulatedCamera, "masks") if arguments.task == "grasp" else (EmulatedImu, "imu")
+            self.sensor: EmulatedImu | EmulatedCamera = kind(folder / name, plant, arguments.seed, self.start)
         except BaseException:
             terminal.close()
             raise
@@ -131,19 +93,33 @@ class Twin:
 
     def run(self) -> None:
         """Run until all trials have ended, or `stop` was called."""
-        self.clock.now = time.monotonic()
+        self.now = time.monotonic()
         while not self._stop:
             now = time.monotonic()
             self.line.serve(now)
             # What takes long waits when the port is due soon, but not for ever.
-            due = min(self.clock.now + PlantClock.SLICE, self.sensor.due)
+            due = min(self.now + SLICE, self.sensor.due)
             free = self.line.due() - now > _BUSY
             if now >= due and (free or now > due + 0.01):
-                self.clock.catch_up(now, PlantClock.SLICE)
+                self.catch_up(now, SLICE)
                 self.sensor.serve(now)
             self._count_trials()
             pause = (min(due, self.line.due()) if free else self.line.due()) - time.monotonic()
             select.select([self.line.terminal], [], [], max(pause, 0.0))
+
+    def catch_up(self, now: float, limit: float = 0.01) -> None:
+        """Advance the plant to a time in s, by at most `limit` s; on a slow machine its time slips."""
+        lag = now - self.now
+        if lag > MAX_LAG:
+            self.now += lag - limit
+            self.slipped += lag - limit
+            if now > self._noted_at + 5.0:
+                self._noted_at = now
+                self.note(f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far")
+        step = min(now - self.now, limit)
+        if step > 0:
+            self.plant.advance(step)
+            self.now += step
 
     def close(self) -> None:
         """Close all ports."""
@@ -156,11 +132,8 @@ class Twin:
 
     def report(self) -> dict[str, Any]:
         """Results of the trials, and what befell the line; JSON-able."""
-        return {
-            "trials": self.plant.results()[: self.arguments.trials],
-            "line": dict(self.line.counts),
-            "slipped_s": round(self.clock.slipped, 3),
-        }
+        trials = self.plant.results()[: self.arguments.trials]
+        return {"trials": trials, "line": dict(self.line.counts), "slipped_s": round(self.slipped, 3)}
 
     def runner_command(self, calibration: Path) -> list[str]:
         """The command that runs the shipped policy of the task on this hand."""
@@ -181,16 +154,8 @@ class Twin:
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
     """The physics for the options."""
-    return EmulatedHand(
-        hand,
-        arguments.task,
-        arguments.seed,
-        trials=arguments.trials,
-        first=arguments.first,
-        kind=arguments.parameters,
-        seconds=arguments.seconds,
-        plant_model=arguments.plant_model,
-    )
+    options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "plant_model")}
+    return EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.parameters, **options)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -207,13 +172,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_wire(hand)
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as temporary:
         folder = arguments.folder or Path(temporary)
-        twin = Twin(arguments, make_plant(arguments, hand), folder, _show)
+        show = functools.partial(print, flush=True)
+        twin = Twin(arguments, make_plant(arguments, hand), folder, show)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = Path(temporary) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
         known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
         save_calibration(calibration, known)
         try:
-            _show(
+            show(
                 f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
                 f"    {shlex.join(twin.runner_command(calibration))}"
             )
@@ -227,10 +193,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             for number, handler in before.items():
                 signal.signal(number, handler)
     return 0
-
-
-def _show(text: str) -> None:
-    print(text, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,20 +13,17 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.wire.driver import WITHOUT, DriverState, JointTargets
+from dexsim_real.wire.driver import WITHOUT, DriverState, HandDriver, JointTargets
 from dexsim_real.wire.frames import Mode, command_block, passive_command
 from dexsim_real.wire.link import LinkConfig
 
 _SLIP = 0.1  # s that the plant may be behind the clock; what is more is let go, as after a breakpoint
 
 
-class MockHand:
-    """A `HandDriver` whose hand is emulated. The plant advances to the clock at each call.
+class MockHand(HandDriver):
+    """A driver whose hand is emulated. The plant advances to the `clock` (s) at each call.
 
-    Args:
-      plant: the hand and its object.
-      measures: what the hand has, names in `driver.WITHOUT`; all by default.
-      clock: s.
+    `measures` is what the hand has, names in `driver.WITHOUT`.
     """
 
     def __init__(
@@ -37,13 +34,11 @@ class MockHand:
         self.motors = passive_command(plant.hand.num_joints)
 
     def connect(self) -> str:
-        """See `HandDriver.connect`."""
         self._time = self._clock()
         self._drive(passive_command(self.plant.hand.num_joints))
         return f"mock of {self.plant.hand.name}"
 
     def send(self, targets: JointTargets) -> None:
-        """See `HandDriver.send`."""
         self._advance()
         mode = Mode.POSITION if targets.on else Mode.PASSIVE
         current = np.round(1e3 * targets.current)
@@ -52,7 +47,6 @@ class MockHand:
         )
 
     def read(self) -> DriverState:
-        """See `HandDriver.read`."""
         self._advance()
         now, sensors = self.plant.measure(), dict[str, np.ndarray]()
         if "currents" in self.measures:

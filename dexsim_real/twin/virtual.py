@@ -6,6 +6,7 @@ exchange is executed by the emulated palm board in the blocks of the wire, so qu
 wire.
 """
 
+import dataclasses
 import heapq
 import itertools
 from collections.abc import Callable, Iterator
@@ -16,19 +17,17 @@ import numpy as np
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.description import Hand
 from dexsim.task_spec import TaskSpec
-from dexsim_real.control.controller import Controller
+from dexsim_real.control.controller import Controller, Tick
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
-from dexsim_real.sensors.camera import CameraConfig, HeightSensor
+from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import BAUD, ImuReader
-from dexsim_real.sensors.object_sensors import ObjectSensors
-from dexsim_real.twin.plant.assistant import nominal_gravity
 from dexsim_real.twin.plant.drives import STALL_CURRENT
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, nominal_gravity
 from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
 from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
@@ -144,51 +143,45 @@ def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
     return sensor
 
 
+@dataclasses.dataclass(eq=False)
 class VirtualRun:
     """One trial of a policy on an emulated hand: the bridge's loops, with the plant's time as their clock.
 
-    Args:
-      plant: a new one, before its first trial.
-      controller: warmed; it is restarted.
-      calibration: of this hand.
-      command: grip command in [0, 1].
-      limits: of the bridge's safety; None is its default.
-
-    Raises:
-      HandError: the policy was trained with another mount than the emulated hand's.
+    Raises HandError: the policy was trained with another mount than the emulated hand's.
     """
 
-    def __init__(
-        self,
-        plant: EmulatedHand,
-        controller: Controller,
-        calibration: Calibration,
-        command: float = 0.5,
-        limits: SafetyConfig | None = None,
-    ):
+    plant: EmulatedHand  # a new one, before its first trial
+    controller: Controller  # warmed; it is restarted
+    calibration: Calibration  # of this hand
+    command: float = 0.5  # grip command in [0, 1]
+    limits: SafetyConfig = SafetyConfig()  # of the bridge's safety
+
+    def __post_init__(self) -> None:
+        plant, controller = self.plant, self.controller
         trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task, plant.hand.thumb_side)
         if np.abs(trained - mounted).max() > 0.01:
-            raise HandError(
-                f"the policy was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm frame, the "
-                f"emulated hand has {np.round(mounted, 2).tolist()}; use a policy that was trained with this mount"
-            )
-        self.plant, self.controller = plant, controller
-        self.safety = Safety(controller.hand, limits_for(limits or SafetyConfig(), controller))
+            raise HandError(f"gravity {np.round(trained, 2)} in training, {np.round(mounted, 2)} here: another mount")
+        self._trial = plant.trial
+        self.safety = Safety(controller.hand, limits_for(self.limits, controller))
         self.port = port = VirtualPort(plant)
-        sensing = HandSensing(controller.hand, HardwareConfig(), calibration)
+        sensing = HandSensing(controller.hand, HardwareConfig(), self.calibration)
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
         objects = ObjectSensors(np.asarray(controller.spec.reference, float))
         objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
         objects.camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
-        self.policy = PolicyLoop(controller, self.safety, objects, command=command, approach=_APPROACH, place=_PLACE)
-        self.trace: list[dict[str, Any]] | None = None
+        self.policy = PolicyLoop(
+            controller, self.safety, objects, command=self.command, approach_seconds=_APPROACH, place_seconds=_PLACE
+        )
 
     def run(self) -> dict[str, Any]:
-        """Run the trial; returns the referee's report, with the measurements of the bridge as `bridge`."""
-        trial, policy = self.plant.trial, self.policy
+        """Run the trial; returns its `report`."""
         for _ in self.ticking():
             pass
-        report = next(r for r in self.plant.results() if r["trial"] == trial)
+        return self.report()
+
+    def report(self) -> dict[str, Any]:
+        """The referee's report of a trial that has ended, with the measurements of the bridge as `bridge`."""
+        policy = self.policy
         measured = {
             "ticks": policy.ticks,
             "sensed_force": np.round(policy.finger_force / max(policy.ticks, 1), 4).tolist(),
@@ -196,31 +189,31 @@ class VirtualRun:
             "latched": self.safety.latched,
             "successes": policy.goals.successes if policy.goals else None,
         }
+        report = next(r for r in self.plant.results() if r["trial"] == self._trial)
         return report | {"command": policy.command, "bridge": measured}
 
-    def ticking(self) -> Iterator[None]:
-        """Run the trial in pieces: yields after the policy's ticks, and ends with the trial."""
-        trial, policy, port = self.plant.trial, self.policy, self.port
+    def ticking(self) -> Iterator[tuple[float, Tick]]:
+        """Run the trial in pieces: yields time in s and tick, after the policy's ticks, and ends with the trial."""
+        policy, port, period, ticks = self.policy, self.port, self.controller.period, list[tuple[float, Tick]]()
         self.loop.tare()
         self.loop.engage()
         self.loop.pace.next = port.time + self.loop.pace.period
         while not self.safety.anchor or policy.approach(port.time):
             self._cycle()
         policy.begin()
+
+        def tick() -> None:
+            if (made := policy.tick(port.time)) is not None:
+                ticks.append((port.time, made))
+
+        tick()
         until = port.time + self.plant.limit + _SLACK
-        self._tick()
-        port.every(self.controller.period, port.time + self.controller.period, self._tick)
-        while self.plant.trial == trial and port.time < until:
-            ticks = policy.ticks
+        port.every(period, port.time + period, tick)
+        while self.plant.trial == self._trial and port.time < until:
             self._cycle()
-            if policy.ticks != ticks:
-                yield
+            yield from ticks
+            ticks.clear()
 
     def _cycle(self) -> None:
         self.loop.cycle()
         self.loop.pace.wait()
-
-    def _tick(self) -> None:
-        tick = self.policy.tick(self.port.time)
-        if tick is not None and self.trace is not None:
-            self.trace.append({"time": self.port.time, "tick": tick, "measured": self.policy.sample.measured})

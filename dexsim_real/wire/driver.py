@@ -64,8 +64,7 @@ class HandDriver(Protocol):
     def connect(self) -> str:
         """Open the line and turn the motors off; returns a line that describes the hand.
 
-        Raises:
-          HandError: the hand does not answer, or is another one.
+        Raises HandError: the hand does not answer, or is another one.
         """
         ...
 
@@ -95,7 +94,6 @@ class DriverPort(ReconnectingPort):
 
     @property
     def missing(self) -> list[str]:
-        """See `HandPort.missing`."""
         return [name for name in WITHOUT if name not in self.driver.measures]
 
     def warnings(self) -> list[str]:
@@ -103,7 +101,6 @@ class DriverPort(ReconnectingPort):
         return [WITHOUT[name] for name in self.missing]
 
     def connect(self) -> str:
-        """See `HandPort.connect`."""
         try:
             line = self.driver.connect()
         except OSError as error:
@@ -113,7 +110,6 @@ class DriverPort(ReconnectingPort):
         return line
 
     def close(self) -> None:
-        """See `HandPort.close`."""
         self._connected = False
         self.driver.close()
 

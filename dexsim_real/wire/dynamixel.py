@@ -14,6 +14,7 @@ Motors run in the current-based position mode: `--hardware.torque-max` is their 
 the maker's tools. Packets, checksum and registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
 """
 
+import functools
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -21,7 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dexsim_real.core.errors import HandError, open_serial
-from dexsim_real.wire.driver import DriverState, JointTargets
+from dexsim_real.core.stream import FrameParser
+from dexsim_real.wire.driver import DriverState, HandDriver, JointTargets
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -65,22 +67,20 @@ PRESENT = Register(
 )  # mA; 0.229 rev/min; ticks; degC
 
 
+def crc16(data: bytes | bytearray) -> int:
+    """CRC-16 of the protocol: polynomial 0x8005, start 0, not reflected; 0xFEE8 for b"123456789"."""
+    value = 0
+    for byte in data:
+        value = (value << 8 & 0xFFFF) ^ _crc_row(value >> 8 ^ byte)
+    return value
+
+
+@functools.cache
 def _crc_row(byte: int) -> int:
     value = byte << 8
     for _ in range(8):
         value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
     return value & 0xFFFF
-
-
-_CRC_ROWS = tuple(map(_crc_row, range(256)))
-
-
-def crc16(data: bytes | bytearray) -> int:
-    """CRC-16 of the protocol: polynomial 0x8005, start 0, not reflected; 0xFEE8 for b"123456789"."""
-    value = 0
-    for byte in data:
-        value = (value << 8 & 0xFFFF) ^ _CRC_ROWS[value >> 8 ^ byte]
-    return value
 
 
 def packet(motor: int, instruction: int, data: bytes) -> bytes:
@@ -98,27 +98,23 @@ class Answer(NamedTuple):
     data: bytes
 
 
-def take_answers(buffer: bytearray) -> list[Answer]:
-    """Remove the whole packets from the bytes received so far; returns the valid answers among them."""
-    answers = []
-    while (at := buffer.find(HEADER)) >= 0 and len(buffer) >= at + 7:
-        size = int.from_bytes(buffer[at + 5 : at + 7], "little")
-        end = at + 7 + size
-        if end > len(buffer) and size <= _LONGEST:
-            break
-        whole = buffer[at:end]
-        if size > _LONGEST or crc16(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
-            del buffer[: at + 1]  # No header, or one with a wrong length before a valid packet.
-            continue
-        body = bytes(whole[7:-2]).replace(_STUFFED, _PLAIN)
-        if body[0] == STATUS and len(body) >= 2:  # Others are the echo of an adapter.
-            answers.append(Answer(whole[4], body[1], body[2:]))
-        del buffer[:end]
-    return answers
+def make_parser() -> FrameParser[Answer]:
+    """Finds the answers in a stream of bytes; other packets are the echo of an adapter."""
+
+    def size(header: bytes) -> int:
+        length = int.from_bytes(header[5:7], "little")
+        return 7 + length if 4 <= length <= _LONGEST else 0
+
+    def decode(whole: bytes) -> Answer | None:
+        body = whole[7:-2].replace(_STUFFED, _PLAIN)
+        sound = crc16(whole[:-2]) == int.from_bytes(whole[-2:], "little")
+        return Answer(whole[4], body[1], body[2:]) if sound and body[0] == STATUS else None
+
+    return FrameParser(HEADER, 7, size, decode)
 
 
-class DynamixelHand:
-    """`HandDriver` of a hand whose joints are one Dynamixel X motor each; `ids` are those of the motors.
+class DynamixelHand(HandDriver):
+    """Driver of a hand whose joints are one Dynamixel X motor each; `ids` are those of the motors.
 
     Raises HandError: an id is given twice, or is none of a motor.
     """
@@ -136,7 +132,7 @@ class DynamixelHand:
         self._health = np.zeros(len(ids), HEALTH.dtype)
 
     def connect(self) -> str:
-        """See `HandDriver.connect`. Motors are set to the current-based position mode, and to answer at once."""
+        """Motors are set to the current-based position mode, and to answer at once."""
         self.close()
         self._serial = open_serial(self.port, self.baud, timeout=_POLL, write_timeout=0.1)
         self._write(TORQUE, 0)  # Settings cannot be changed otherwise.
@@ -152,7 +148,7 @@ class DynamixelHand:
         return f"{self.port}: {len(self.ids)} Dynamixel motors, current limits {self._limit.min():.0f} mA or more"
 
     def send(self, targets: JointTargets) -> None:
-        """See `HandDriver.send`. Motors come on after they have their first target."""
+        """Motors come on after they have their first target."""
         if targets.on != self._on:
             self._look = 0
         self._on = targets.on
@@ -170,7 +166,6 @@ class DynamixelHand:
         self._write(TORQUE, 1, again=False)
 
     def read(self) -> DriverState | None:
-        """See `HandDriver.read`."""
         present, alert = self._read(PRESENT)
         if present is None:
             return None
@@ -189,7 +184,6 @@ class DynamixelHand:
         )
 
     def close(self) -> None:
-        """See `HandDriver.close`."""
         if self._serial is not None:
             self._serial.close()
             self._serial = None
@@ -201,10 +195,8 @@ class DynamixelHand:
             if values is not None:
                 return values
         silent = [motor for motor in self.ids if motor not in self._answered]
-        raise HandError(
-            f"{self.port}: no answer of the motors {', '.join(map(str, silent)) or 'in time'}; check power and cables, "
-            f"the ids, and the baud rate (now {self.baud})"
-        )
+        which = ", ".join(map(str, silent)) or "in time"
+        raise HandError(f"{self.port}: no answer of the motors {which}; check power, ids, and baud rate ({self.baud})")
 
     def _read(self, register: Register) -> tuple[np.ndarray | None, bool]:
         """The values [J] of a register, None unless all motors answer in time; and whether one reports an alert."""
@@ -213,10 +205,9 @@ class DynamixelHand:
         self._serial.reset_input_buffer()
         self._serial.write(request)
         until = time.monotonic() + 10 * (len(request) + len(self.ids) * (size + 11)) / self.baud + _MARGIN
-        buffer, answers = bytearray(), dict[int, Answer]()
+        parser, answers = make_parser(), dict[int, Answer]()
         while len(answers) < len(self.ids) and time.monotonic() < until:
-            buffer += self._serial.read(max(self._serial.in_waiting, 1))
-            for answer in take_answers(buffer):
+            for answer in parser.feed(self._serial.read(max(self._serial.in_waiting, 1))):
                 if answer.motor in self.ids and len(answer.data) == size and not answer.error & ~ALERT:
                     answers[answer.motor] = answer
         self._answered = set(answers)

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dexsim.core.errors import DexsimError
+from dexsim_real.core.stream import FrameParser
 
 HEAD = b"\x55\xaa"
 HEADER = struct.Struct("<2sBBBH")
@@ -141,56 +142,24 @@ class Frame:
         return body + crc16(body).to_bytes(2, "little")
 
 
-class Parser:
-    """Extracts frames from a damaged or truncated stream of bytes; memory is bounded by one frame and one chunk.
+class Parser(FrameParser[Frame]):
+    """The frames of a stream; `lengths` are `HAND_REPLIES` or `HOST_REQUESTS`.
 
-    A header is valid only with a known command and a length that this command can have, by `lengths`: `HAND_REPLIES` or
-    `HOST_REQUESTS`. Then the checksum decides. When it fails, the search continues one byte after that header, so every
-    intact frame of the stream is found. `frames` and `crc_errors` count accepted frames, and valid headers with a wrong
-    checksum.
+    A header is valid only with a known command and a length that this command can have. Then the checksum decides.
     """
 
     def __init__(self, lengths: Mapping[int, range]):
-        self._lengths = {int(command): span for command, span in lengths.items()}
-        self._buffer = bytearray()
-        self.frames = self.crc_errors = 0
+        def size(header: bytes) -> int:
+            *_, command, size = HEADER.unpack(header)
+            return OVERHEAD + size if size in lengths.get(command, ()) else 0
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """Add received bytes; returns the frames that they complete."""
-        self._buffer += data
-        return self._scan(final=False)
+        super().__init__(HEAD, HEADER.size, size, _read_frame)
 
-    def expire(self) -> list[Frame]:
-        """End of transmission: drop an incomplete frame, and return the frames inside its bytes."""
-        return self._scan(final=True)
 
-    @property
-    def pending(self) -> int:
-        """Number of bytes of an incomplete frame."""
-        return len(self._buffer)
-
-    def _scan(self, final: bool) -> list[Frame]:
-        buffer, found, at, done = self._buffer, [], 0, 0
-        while (at := buffer.find(HEAD, at)) >= 0:
-            end = at + OVERHEAD  # of this frame, as far as its header has arrived
-            if len(buffer) >= at + HEADER.size:
-                _, source, target, command, size = HEADER.unpack_from(buffer, at)
-                end = end + size if size in self._lengths.get(command, ()) else at
-            if end > len(buffer) and not final:
-                break
-            whole = bytes(buffer[at:end]) if end <= len(buffer) else b""
-            at += 1  # From here, unless the frame is sound.
-            if whole and crc16(whole[:-2]) == int.from_bytes(whole[-2:], "little"):
-                self.frames += 1
-                found.append(Frame(source, target, command, whole[HEADER.size : -2]))
-                at = done = end
-            elif whole:
-                self.crc_errors += 1
-        else:
-            # The last byte may be the first half of a head.
-            at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > done)
-        del buffer[:at]
-        return found
+def _read_frame(data: bytes) -> Frame | None:
+    _, source, target, command, _ = HEADER.unpack_from(data)
+    sound = crc16(data[:-2]) == int.from_bytes(data[-2:], "little")
+    return Frame(source, target, command, data[HEADER.size : -2]) if sound else None
 
 
 def command_block(
@@ -226,24 +195,19 @@ def passive_command(joints: int = JOINTS) -> np.ndarray:
 
 def decode_command(data: bytes, joints: int = JOINTS) -> np.ndarray:
     """Joint commands [J] from the data of a host's `EXCHANGE`. FrameError: wrong size, or ids that do not count up."""
-    block = _decode(data, np.dtype((JOINT_COMMAND, (joints,))))
-    _check_ids(block["id"])
-    return block
+    return _decode(data, np.dtype((JOINT_COMMAND, (joints,))))
 
 
 def decode_state(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
     """The state from the data of a hand's `EXCHANGE`. FrameError: wrong size, or joint ids that do not count up."""
-    block = _decode(data, dtype)
-    _check_ids(block["joint"]["id"])
-    return block
+    return _decode(data, dtype)
 
 
 def _decode(data: bytes, dtype: np.dtype) -> np.ndarray:
     if len(data) != dtype.itemsize:
         raise FrameError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
-    return np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
-
-
-def _check_ids(ids: np.ndarray) -> None:
+    block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
+    ids = block["id"] if dtype.base == JOINT_COMMAND else block["joint"]["id"]
     if not np.array_equal(ids, np.arange(len(ids))):
         raise FrameError(f"expected joint ids 0 to {len(ids) - 1} in order, got {ids.tolist()}")
+    return block

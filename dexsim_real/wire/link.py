@@ -7,14 +7,19 @@
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from dexsim.calibration.maps import Calibration
 from dexsim.core.config import Config, Range, setting
 from dexsim.hand.description import Hand
-from dexsim_real.wire.identity import Identity, check_identity
+from dexsim_real.core.errors import HandError
 
+SIDE, SERIAL_NUMBER = 20, 21
+"""Registers of the hand's side and of its serial number (32 bytes), by the vendor's header. How an answer holds a
+register is not public. Assumed is what the emulated hand sends: the register's number in two bytes, low byte first,
+then its content. Serial numbers begin with the model, by the manual 2L32 (left) or 2R32 (right)."""
 UNCONFIRMED = "the hand did not confirm that its motors are off"
 PATIENCE = 5.0  # s for which a hand whose motors may be on and that does not answer is told to turn them off
 BRIEF = 0.3  # s, the same for a hand that was off already
@@ -50,6 +55,7 @@ _NAMES = {
     80: "current sensor not zeroed",
     81: "force mode not supported",
 }
+_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right", "2l32": "left", "2r32": "right"}
 _PASSING = frozenset({2, 3, 4, 6, 18, 19, 20, 36, 39, 40, 41, 50, 70})
 
 
@@ -131,6 +137,54 @@ class Reply:
     generation: int  # number of handshakes; it grows when the hand was disconnected
 
 
+class Identity(NamedTuple):
+    """What a hand tells about itself; a field is empty if it does not."""
+
+    serial_number: str = ""
+    handedness: str = ""  # "left", "right", or "code N" when the meaning of the answer is not known
+
+    def __str__(self) -> str:
+        return f"{self.handedness or 'unknown side'}, serial number {self.serial_number or 'unknown'}"
+
+
+def read_identity(serial_number: bytes, side: bytes) -> Identity:
+    """The identity in the contents of the two registers; empty for one that the hand did not answer."""
+    text = printable(serial_number)
+    known = [_WORDS[word] for word in (printable(side).lower(), text[:4].lower()) if word in _WORDS]
+    return Identity(text, known[0] if known else f"code {side[0]}" if side else "")
+
+
+def check_identity(identity: Identity, hand: Hand, calibration: Calibration | None = None) -> list[str]:
+    """Check that a hand fits the model and the calibration; returns notes about what could not be checked.
+
+    Raises HandError: it is another hand.
+    """
+    serial, side = identity
+    if side in ("left", "right") and side != hand.side:
+        raise HandError(f"this is a {side} hand (serial number {serial}), the model a {hand.side} one: see --hand")
+    known = (calibration.serial, calibration.handedness) if calibration else ("", "")
+    if known[0] and serial != known[0]:
+        this = f"this is hand {serial}" if serial else "the hand does not tell its serial number"
+        todo = "calibrate this hand, or remove the file's serial number if it is this hand's"
+        raise HandError(f"{this}, the calibration is of hand {known[0]}: {todo}")
+    if known[1] and side and side != known[1]:
+        raise HandError(f"this hand is {side}, the calibration is of a {known[1]} one: calibrate this hand")
+    notes = []
+    if not serial:
+        notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
+    elif calibration and not known[0]:
+        notes.append("the calibration names no serial number: it may be of another hand")
+    if side.startswith("code"):
+        notes.append(f"the hand gives its side as {side}, whose meaning is not known")
+    return [f"warning: {note}" for note in notes]
+
+
+def printable(content: bytes) -> str:
+    """The text at the beginning of a register or an answer; empty for what is none."""
+    text = content.split(b"\0")[0].decode("ascii", "replace").strip()
+    return text if text.isprintable() and text.isascii() else ""
+
+
 class HandPort:
     """The interface of a hand. `exchange` is called from one thread only."""
 
@@ -155,8 +209,7 @@ class HandPort:
     def connect(self) -> str:
         """Open the port and identify the hand; returns a line that describes it. Motors stay off.
 
-        Raises:
-          HandError: the port cannot be opened, or the hand does not answer.
+        Raises HandError: the port cannot be opened, or the hand does not answer.
         """
         raise NotImplementedError
 
@@ -187,32 +240,25 @@ class HandPort:
                 return False
 
 
+@dataclasses.dataclass(eq=False)
 class ReconnectingPort(HandPort):
-    """What ports have in common: a line that fails is opened again, after waits that double at each attempt.
+    """What ports have in common: a line that fails is opened again, after waits that double at each attempt."""
 
-    Args:
-      config: of the link; its `backoff` counts.
-      passive: the command that turns the motors off, until whose answer no other one is sent on a line that is new.
-      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
-      clock: s, in which replies are stamped; that of the exchange loop.
-    """
+    config: LinkConfig  # its `backoff` counts
+    passive: np.ndarray  # turns the motors off; until its answer no other command is sent on a line that is new
+    _: dataclasses.KW_ONLY
+    tap: Callable[[str, bytes], None] | None = None
+    """Called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`."""
+    clock: Callable[[], float] | None = None  # s, in which replies are stamped; that of the exchange loop
 
-    def __init__(
-        self,
-        config: LinkConfig,
-        passive: np.ndarray,
-        *,
-        tap: Callable[[str, bytes], None] | None = None,
-        clock: Callable[[], float] | None = None,
-    ):
-        self.config, self.counts = config, LinkCounts()
-        self._tap = tap or (lambda direction, data: None)
-        self._clock, self._sleep = clock or time.monotonic, time.sleep
+    def __post_init__(self) -> None:
+        self.counts = LinkCounts()
+        self._tap = self.tap or (lambda direction, data: None)
+        self._clock, self._sleep = self.clock or time.monotonic, time.sleep
         self._connected, self._returning, self._generation = False, False, 0
-        self._passive, self._retry_at, self._pause = passive, 0.0, config.backoff[0]
+        self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
     def exchange(self, command: np.ndarray) -> Reply | None:
-        """See `HandPort.exchange`."""
         self.refusal = None
         try:
             if not self._connected:
@@ -222,7 +268,7 @@ class ReconnectingPort(HandPort):
                 self._reopen()
                 self.counts.reconnects += 1
                 self._returning, self._pause = True, self.config.backoff[0]
-            reply = self._exchange(self._passive if self._returning else command)
+            reply = self._exchange(self.passive if self._returning else command)
         except OSError:  # Base class of pyserial's errors.
             self.close()
             self._retry_at = self._clock() + self._pause

@@ -14,11 +14,10 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError, find_function, open_serial
-from dexsim_real.wire import frames
+from dexsim_real.wire import frames, link
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
-from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, printable, read_identity
-from dexsim_real.wire.link import HandPort, LinkConfig, ReconnectingPort, Refusal, Reply, read_refusal
+from dexsim_real.wire.link import HandPort, Identity, LinkConfig, ReconnectingPort, Refusal, Reply
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -61,7 +60,6 @@ class SerialHand(ReconnectingPort):
         return f"{self.port}: hand {self.config.hand_id}, {self.identity}, firmware {version}"
 
     def close(self) -> None:
-        """See `HandPort.close`."""
         self._connected = False
         if self._serial is not None:
             with contextlib.suppress(OSError):
@@ -108,13 +106,13 @@ class SerialHand(ReconnectingPort):
             self.counts.lost += 1
             raise
         finally:
-            self.counts.crc_errors = self._parser.crc_errors
+            self.counts.crc_errors = self._parser.damaged
         if answer is None:
             self.counts.corrupt += self._received > before
             self.counts.silent += self._received == before
         elif answer.command == Command.ERROR:
             self.counts.refused += 1
-            self.refusal, answer = read_refusal(answer.data), None
+            self.refusal, answer = link.read_refusal(answer.data), None
         else:
             self.counts.answered += 1
         return answer, sent
@@ -185,14 +183,14 @@ class SerialHand(ReconnectingPort):
         while True:
             frame, _ = self._request(Command.VERSION, b"", 64)
             if frame is not None:
-                version = printable(frame.data) or frame.data.hex(" ")
+                version = link.printable(frame.data) or frame.data.hex(" ")
             if self._exchange(passive_command()) is not None:
                 return version
             if self._clock() > until:
                 raise HandError(self._silence())
 
     def _read_identity(self) -> Identity:
-        return read_identity(self._register(SERIAL_NUMBER), self._register(SIDE))
+        return link.read_identity(self._register(link.SERIAL_NUMBER), self._register(link.SIDE))
 
     def _register(self, number: int) -> bytes:
         """Content of a register; empty when the hand does not tell."""
@@ -218,13 +216,11 @@ class SerialHand(ReconnectingPort):
             why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
         elif self.refusal is not None:
             why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
-        elif not self._parser.frames and not self._parser.crc_errors:
+        elif not self._parser.frames and not self._parser.damaged:
             why = f"no bytes belong to a frame; set --link.baud to that of the hand (now {config.baud} baud)"
         else:
-            why = (
-                f"the hand answers without a valid state ({counts.crc_errors} wrong checksums, {counts.refused} "
-                "refusals); check cable and termination"
-            )
+            what = f"{counts.crc_errors} wrong checksums, {counts.refused} refusals"
+            why = f"the hand answers without a valid state ({what}); check cable and termination"
         return f"{self.port}: {why}"
 
     def _reopen(self) -> None:
@@ -242,11 +238,8 @@ class SerialHand(ReconnectingPort):
 def check_wire(hand: Hand) -> None:
     """Raises HandError: the hand has other joints or taxels than the frames carry."""
     if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (frames.JOINTS, frames.TIPS, frames.TAXELS):
-        raise HandError(
-            f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the XHand's "
-            f"frames carry {frames.JOINTS} and {frames.TIPS} x {frames.TAXELS}: give a driver, --port sdk:MODULE "
-            "(docs/bridge.md)"
-        )
+        has = f"{hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels"
+        raise HandError(f"{hand.name}: {has}, unlike the XHand: give a driver, --port sdk:MODULE (docs/bridge.md)")
 
 
 def open_port(spec: str, hand: Hand, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:

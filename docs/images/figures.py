@@ -171,7 +171,7 @@ def calibration() -> None:
 
     from dexsim.calibration.maps import load_calibration, torque_constants
     from dexsim_real.calibrate.__main__ import fit_and_report, record
-    from dexsim_real.calibrate.options import CalibrateArguments
+    from dexsim_real.calibrate.bench import CalibrateArguments
     from dexsim_real.twin.virtual import VirtualPort
 
     hand = dexsim.load_hand()

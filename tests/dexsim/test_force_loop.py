@@ -93,8 +93,8 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
     command by the force loop."""
     pytest.importorskip("serial")
     from dexsim_real.control.controller import Controller
+    from dexsim_real.sensors.camera import ObjectEstimate
     from dexsim_real.sensors.hand import HandMeasurement
-    from dexsim_real.sensors.object_sensors import ObjectEstimate
 
     env = grasp_env
 

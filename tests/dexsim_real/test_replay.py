@@ -12,7 +12,7 @@ from following_hand import FollowingHand, arguments, records, summary
 from dexsim.core import cli
 from dexsim.core.errors import DexsimError
 from dexsim_real import replay
-from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.run import __main__ as run
 

@@ -7,9 +7,8 @@ import numpy as np
 from press_bench import Plate
 
 from dexsim_real.calibrate import __main__ as calibrate
-from dexsim_real.calibrate.bench import Operator
-from dexsim_real.calibrate.options import CalibrateArguments, PressConfig
-from dexsim_real.calibrate.plan import placements
+from dexsim_real.calibrate.bench import CalibrateArguments, Operator, PressConfig
+from dexsim_real.calibrate.procedure import placements
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.frames import Mode
 

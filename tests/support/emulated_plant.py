@@ -3,9 +3,8 @@
 import mujoco
 import numpy as np
 
-from dexsim_real.twin.plant.assistant import Stage, put
 from dexsim_real.twin.plant.drives import Drives, Heat
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put
 from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.wire.frames import Mode, command_block
 
@@ -31,7 +30,7 @@ def world(hand, task="rotate", **overrides):
 
 def free(plant, position, quat=(1.0, 0.0, 0.0, 0.0), *, judged=False):
     """Let go of the object anywhere; unless judged, no referee calls that a drop."""
-    plant._assistant.stage = Stage.FREE
+    plant.stage = Stage.FREE
     if not judged:
         plant._look = lambda: None
     put(plant._scene, plant._data, np.asarray(position, float), np.asarray(quat, float))

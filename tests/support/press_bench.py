@@ -11,8 +11,7 @@ import numpy as np
 
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.identity import Identity
-from dexsim_real.wire.link import HandPort, LinkCounts, Reply
+from dexsim_real.wire.link import HandPort, Identity, LinkCounts, Reply
 
 EXCHANGE = 0.0096  # s
 

@@ -10,10 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim_real.calibrate.plan import Placement, placements
-from dexsim_real.twin.plant.assistant import Stage, put
+from dexsim_real.calibrate.procedure import Placement, placements
 from dexsim_real.twin.plant.drives import STALL_CURRENT
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
 from dexsim_real.wire.frames import Mode
 
@@ -33,7 +32,7 @@ class PressBench(EmulatedHand):
 
     def __init__(self, hand, seed=0, kind="outside"):
         super().__init__(hand, "grasp", seed, kind=kind, overrides=_SOLID)
-        self._plan, self._assistant.stage = placements(hand), Stage.FREE
+        self._plan, self.stage = placements(hand), Stage.FREE
         skin, noise = copy.copy(self._skin), self._noise
         self._enter(self._draw(self.parameters, PEN), np.random.default_rng(seed))
         self._skin, self._noise = skin, noise  # It is still the hand of the first trial.

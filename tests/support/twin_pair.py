@@ -5,8 +5,7 @@ import threading
 from twin_plant import REST, ScriptedPlant
 
 from dexsim_real.twin.__main__ import Twin, TwinArguments
-from dexsim_real.twin.wire.firmware import Firmware
-from dexsim_real.twin.wire.line import HandLine
+from dexsim_real.twin.wire.firmware import Firmware, HandLine
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 
@@ -26,7 +25,7 @@ class Cable:
     def __init__(self):
         self.now, self.plant = 1000.0, ScriptedPlant()
         self.to_hand, self.to_host = bytearray(), bytearray()
-        self.line = HandLine(self, Firmware(self.plant), catch_up=self._catch_up)
+        self.line = HandLine(self, Firmware(self.plant), self._catch_up)
 
     def _catch_up(self, now):
         self.plant.advance(max(now - 1000.0 - self.plant.time, 1e-6))
@@ -68,7 +67,7 @@ class Running:
 
     def __init__(self, folder, plant=None, **options):
         self.plant = plant or ScriptedPlant()
-        self.twin = Twin(TwinArguments(**options), self.plant, folder)
+        self.twin = Twin(TwinArguments(**options), self.plant, folder, lambda text: None)
         self.port = str(self.twin.line.terminal.name)
         self._thread = threading.Thread(target=self.twin.run, daemon=True)
         self._thread.start()

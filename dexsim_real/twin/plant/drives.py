@@ -45,10 +45,7 @@ class Heat:
 class Drives:
     """State of the twelve drives; arrays [12] in the order of the hand's joints.
 
-    Args:
-      torque_limit: [12] Nm, nominal stall torque.
-      speed_limit: [12] rad/s, nominal no-load speed.
-      heat: thermal model.
+    `torque_limit` [12] Nm and `speed_limit` [12] rad/s are the nominal torque at stall and speed without load.
     """
 
     def __init__(self, torque_limit: np.ndarray, speed_limit: np.ndarray, heat: Heat = Heat()):
@@ -83,15 +80,8 @@ class Drives:
         self._next = min(self._next, there.min())
 
     def step(self, time: float, rotor: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate one firmware period.
-
-        Args:
-          time: s.
-          rotor, speed: [12] rad, rad/s of the rotors, seen at the joint.
-
-        Returns:
-          Torque on the rotors and largest dry friction, both [12] Nm.
-        """
+        """Simulate one firmware period from a time in s, with angles and speeds [12] rad, rad/s of the rotors, seen at
+        the joint. Returns the torque on the rotors and the largest dry friction, both [12] Nm."""
         if time >= self._next:
             self._receive(time)
         self.current = current = self._current(rotor, speed)

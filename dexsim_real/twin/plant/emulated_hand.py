@@ -2,10 +2,18 @@
 
 C MuJoCo runs at 0.5 ms (`scene`), the firmware at 1 ms (`drives`), fingertips (`taxel_array`) and referee at 10 ms. The
 palm frame is the world frame. All follows from the seed and the commands.
+
+The assistant is an emulated person who places the object, releases it, and takes it away:
+
+    AWAY -> (joint targets at the start posture, joints near it) -> HOLD -> (joint targets move) -> FREE -> AWAY
+
+While away the object has its release orientation, so that an IMU in it can be aligned. Each object waits for the hand
+to return to the start posture.
 """
 
 import collections
 import dataclasses
+import enum
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +23,6 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.assistant import GRAVITY, Assistant, Stage, find_place, put, start_of, tilted_gravity
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.hand_model import own_model, read_model
 from dexsim_real.twin.plant.parameters import (
@@ -33,11 +40,35 @@ from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_s
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 from dexsim_real.wire.frames import Mode
 
+ROTATE_PLACE = (0.007, 0.079)
+"""Position along the palm (y, z) m of a right hand where a cube is placed: the centre of the start states in training.
+Few of them are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
+CLEAR_POSTURE = (1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6)  # rad, of the XHand
+CLEAR_REFERENCE, CLEAR_PLACE = (0.072, 0.005, 0.098), (0.066, 0.007, 0.099)
+"""Nominal position, m, of a cube that turns clear of the palm, and where it is placed: the mean of the start states."""
+CLEAR_AXIS = (0.6, 0.0, -0.8)  # about which it turns
+MOUNT, CLEAR_MOUNT = (-0.2, -0.2), (-1.1, 0.0)
+"""Pitch and roll, rad, of the hand that is palm up (rotate_clear: nearly upright, fingers down): wrist and thumb side
+lowered, or raised where negative."""
+GRAVITY = 9.81  # m/s^2
+PALM_FACE = 0.020  # m, x of the emulated hand's palm
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
 _MEMORY = 0.2  # s, longest delay of a sensor
-PALM_FACE = 0.020  # m, x of the emulated hand's palm
 _LOOK = 0.01  # s between two samples of the fingertips, and updates of the referee
-_OBJECTS = 200  # sampled for a trial, until one has room between the fingers
+_OBJECTS, _PLACES = 200, 60  # sampled for a trial, until one has room between the fingers; places for an object
+_ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
+_NEAR = 0.3  # rad, largest distance of a joint from the start posture
+_OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
+_STEP, _STEPS = 0.001, 20  # m, and how many an object is moved down or up where fingers carry it
+_SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the release position
+
+
+class Stage(enum.Enum):
+    """State of the object in a trial."""
+
+    AWAY = "away"
+    HOLD = "hold"
+    FREE = "free"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,56 +91,39 @@ class _Past(NamedTuple):
     current: np.ndarray
 
 
+@dataclasses.dataclass(eq=False)
 class EmulatedHand:
-    """A hand with an object, trial after trial. The owner advances its time.
+    """A hand with an object, trial after trial, none of which depends on another. The owner advances its time.
 
-    Args:
-      hand: model of the hand.
-      task: of `parameters.TASKS`.
-      seed: of all random numbers.
-      trials: number of trials, after which the hand stays empty; None is no limit.
-      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
-      overrides: fixed parameters (`sample_trial`).
-      seconds: time limit of a trial; None is that of the task.
-      shape: name of the objects (grasp); None samples one per trial.
-      first: number of the first trial. A trial does not depend on the trials before it.
-      plant_model: MJCF of a hand (`hand_model.read_model`): its body and contacts take the place of the emulated hand's
-        own.
-
-    Raises:
-      HandError: the plant model does not fit the hand, or decides an overridden parameter itself.
+    Raises HandError: the plant model does not fit the hand, or decides an overridden parameter itself.
     """
 
-    def __init__(
-        self,
-        hand: Hand,
-        task: str,
-        seed: int = 0,
-        *,
-        trials: int | None = None,
-        kind: str = "outside",
-        overrides: Mapping[str, float] | None = None,
-        seconds: float | None = None,
-        shape: str | None = None,
-        first: int = 0,
-        plant_model: str | Path | None = None,
-    ):
-        self.hand, self.task = hand, task
-        self._model = read_model(plant_model, hand) if plant_model else own_model(hand)
-        if plant_model and (own := sorted(OF_THE_FILE & set(overrides or ()))):
-            raise HandError(f"{own[0]} is not a parameter of a plant model: change it in {plant_model}")
+    hand: Hand
+    task: str  # of `parameters.TASKS`
+    seed: int = 0  # of all random numbers
+    _: dataclasses.KW_ONLY
+    trials: int | None = None  # number of trials, after which the hand stays empty; None is no limit
+    kind: str = "outside"  # of `parameters.KINDS`
+    overrides: Mapping[str, float] | None = None  # fixed parameters (`sample_trial`)
+    seconds: float | None = None  # time limit of a trial; None is that of the task
+    shape_name: str | None = None  # of the objects (grasp); None samples one per trial
+    first: int = 0  # number of the first trial
+    plant_model: str | Path | None = None  # MJCF (`hand_model.read_model`) whose body and contacts replace our own
+
+    def __post_init__(self) -> None:
+        hand = self.hand
+        self._model = read_model(self.plant_model, hand) if self.plant_model else own_model(hand)
+        if self.plant_model and (own := sorted(OF_THE_FILE & set(self.overrides or ()))):
+            raise HandError(f"{own[0]} is not a parameter of a plant model: change it in {self.plant_model}")
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
         self._skin = EmulatedTaxels(hand, by_point=self._model.foreign)
         self.time, self._ticks, self._due = 0.0, 0, 0.0
         self._command: np.ndarray | None = None
         # The fingers of a hand without commands are slightly bent.
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
-        self.seed, self.kind, self._end = seed, kind, None if trials is None else first + trials
-        self._overrides, self._seconds, self._shape = overrides, seconds, shape
-        self._start = start_of(hand, task)
-        self._assistant = Assistant(self._start.posture)
+        self._start = start_of(hand, self.task)
         self._done: list[dict[str, Any]] = []
-        self.trial = first - 1
+        self.trial = self.first - 1
         self._next_trial()
 
     def drive(self, command: np.ndarray) -> None:
@@ -184,11 +198,6 @@ class EmulatedHand:
         """Time limit of a trial in s."""
         return self._referee.limit
 
-    @property
-    def stage(self) -> Stage:
-        """State of the object."""
-        return self._assistant.stage
-
     def results(self) -> list[dict[str, Any]]:
         """True results of all trials so far, including the current one; JSON-able."""
         return [*self._done] if self._finished else [*self._done, self._report()]
@@ -197,17 +206,17 @@ class EmulatedHand:
 
     @property
     def _finished(self) -> bool:
-        return self._end is not None and self.trial >= self._end
+        return self.trials is not None and self.trial >= self.first + self.trials
 
     def _next_trial(self) -> None:
         self.trial += 1
-        self._assistant.begin()
+        self._take_away()
         if self._finished:
             return
         rng = np.random.default_rng([self.seed, self.trial])
         for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
-            parameters = sample_trial(self.task, rng, self.kind, self._overrides, self.hand)
-            shape = sample_shape(parameters, rng, self._shape)
+            parameters = sample_trial(self.task, rng, self.kind, self.overrides, self.hand)
+            shape = sample_shape(parameters, rng, self.shape_name)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
             self._palm_face = palm_face(scene, tuple(self._start.place)) if self._model.foreign else own
@@ -218,9 +227,8 @@ class EmulatedHand:
             raise HandError(f"trial {self.trial}: none of {_OBJECTS} objects had room in the hand's start posture")
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
-        self._assistant.reaction = float(parameters.value.get("reaction", 0.0))
         start, fingers, side = self._start, self.hand.num_fingers, self.hand.thumb_side
-        self._referee = Referee(self.task, start.reference, start.axis, self._seconds, fingers, side)
+        self._referee = Referee(self.task, start.reference, start.axis, self.seconds, fingers, side)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -257,9 +265,7 @@ class EmulatedHand:
             "parameter_kind": self.kind,
             "plant": self._model.name,
             "shape": self.shape.name,
-            "parts": [
-                {"kind": part.kind, "size": list(part.size), "place": list(part.place)} for part in self.shape.parts
-            ],
+            "parts": [{"kind": p.kind, "size": list(p.size), "place": list(p.place)} for p in self.shape.parts],
             "stage": self.stage.value,
             **self._referee.report(),
             "parameters": {name: np.round(value, 6).tolist() for name, value in values.items()},
@@ -334,11 +340,28 @@ class EmulatedHand:
             self._done.append(self._report())
             self._next_trial()
 
+    def _take_away(self) -> None:
+        """Take the object away, and wait for the hand."""
+        self.stage = Stage.AWAY
+        self._moved: float | None = None  # s, when the targets left the start posture
+
     def _assist(self) -> None:
-        command, targets = self._command, None
-        if command is not None and np.all(command["mode"] == Mode.POSITION):
-            targets = command["position"].astype(float)
-        if self._assistant.watch(self.time, targets, self._joints) is Stage.FREE:
+        """What the assistant does now. Released is the object some time after the targets have moved, as by a person,
+        and without motors not at all."""
+        command, posture = self._command, self._start.posture
+        if command is None or np.any(command["mode"] != Mode.POSITION):
+            self._take_away()
+            return
+        off = np.max(np.abs(command["position"].astype(float) - posture))
+        if self.stage is Stage.AWAY:
+            if off < _ARRIVED and np.max(np.abs(self._joints - posture)) < _NEAR:
+                self.stage = Stage.HOLD
+            return
+        if self._moved is None and off > _LEFT:
+            self._moved = self.time
+        reaction = float(self.parameters.value.get("reaction", 0.0))
+        if self._moved is not None and self.time - self._moved >= reaction:
+            self.stage = Stage.FREE
             put(self._scene, self._data, *self._place[:3])
             self._pushes.begin(self.time)
 
@@ -367,3 +390,121 @@ class Pushes:
             self._until = time + parameters.push_seconds
             self.begin(time)
         return self.last
+
+
+# --- start, mount and place of a trial ---------------------------------------------------------------
+
+
+class Start(NamedTuple):
+    """Where the trials of a hand begin; palm frame."""
+
+    posture: np.ndarray  # [J] rad
+    reference: np.ndarray  # [3] m, nominal position of the object
+    place: np.ndarray  # [2] m, y and z where it is placed on the palm; [3] m, x as well: between the fingertips
+    axis: np.ndarray = np.array((1.0, 0.0, 0.0))  # about which it turns
+
+
+def start_of(hand: Hand, task: str) -> Start:
+    """The start by the hand's TOML. HandError: there is none in it."""
+    if task == "rotate_clear":
+        if hand.num_joints != len(CLEAR_POSTURE):
+            raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
+        mirror = np.array((1.0, hand.thumb_side, 1.0))
+        reference, place = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE
+        return Start(np.array(CLEAR_POSTURE), reference, place, np.array(CLEAR_AXIS))
+    if skill_of(task) == "grasp":
+        posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
+        place = np.array(reference[1:])
+    else:
+        posture, reference, names = hand.rotate_posture, hand.rotate_reference, "[rotate] with posture and reference"
+        place = np.array(ROTATE_PLACE) * (hand.thumb_side, 1.0)
+    if not (posture and reference):
+        raise HandError(f"{hand.name}: the emulated hand needs a {names} in its TOML")
+    return Start(np.array(posture), np.array(reference), place)
+
+
+def nominal_gravity(task: str, thumb_side: float = 1.0) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame: upside down to grasp, palm up on a leaning mount to rotate.
+
+    `thumb_side` is the hand's (`Hand.thumb_side`), here and below.
+    """
+    if task == "grasp":
+        return GRAVITY * np.array([1.0, 0.0, 0.0])
+    pitch, roll = CLEAR_MOUNT if task == "rotate_clear" else MOUNT
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), thumb_side * np.sin(roll), -np.sin(pitch) * np.cos(roll)])
+
+
+def tilted_gravity(task: str, tilt: np.ndarray, thumb_side: float = 1.0) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame of a hand tilted by angles [2] rad about two horizontal axes."""
+    down = nominal_gravity(task, thumb_side)
+    way = down / GRAVITY
+    side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made horizontal
+    side = side / np.linalg.norm(side)
+    for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
+        down = matrix(turn(axis, float(angle))) @ down
+    return down
+
+
+class Place(NamedTuple):
+    """Release pose and velocity of an object, palm frame."""
+
+    position: np.ndarray  # [3] m
+    quat: np.ndarray  # [4]
+    velocity: np.ndarray  # [3] m/s
+    shelf: np.ndarray  # [3] m, where the object waits
+
+
+def find_place(
+    scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float, start: Start
+) -> Place | None:
+    """Sample a release pose of the object over a palm at x = `face` m that the fingers in the start posture leave
+    clear; None if there seems to be none."""
+    data = mujoco.MjData(scene.model)
+    scene.set_joints(data, start.posture)
+    for _ in range(_PLACES):
+        if parameters.task != "grasp":
+            quat = turn(start.axis, parameters.heading_error * rng.uniform(-1, 1))
+            shift = parameters.place_error * rng.uniform(-1, 1, 2)
+            gap, speed = 0.0005, 0.0
+        else:
+            # The long axis is across the fingers with a small error; the roll about it is uniform.
+            roll, about, askew = rng.uniform(-1, 1, 3)
+            quat = turn((0.0, 0.0, 1.0), roll * np.pi)
+            for axis, angle in (((1, 0, 0), -np.pi / 2), ((0, 0, 1), 0.2 * askew), ((1, 0, 0), 0.5 * about)):
+                quat = product(turn(axis, angle), quat)
+            shift = 0.01 * rng.uniform(-1, 1, 2)
+            gap, speed = parameters.gap, parameters.release_speed
+        if len(start.place) == 3:
+            position = lower(scene, data, start.place + (0.0, *shift), quat)
+        else:
+            down = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
+            position = np.array([face + gap + shape.reach(down), *(start.place + shift)])
+        if position is not None and is_clear(scene, data, position, quat):
+            return Place(position, quat, np.array([speed, 0.0, 0.0]), position + _SHELF)
+    return None
+
+
+def lower(scene: Scene, data: mujoco.MjData, place: np.ndarray, quat: np.ndarray) -> np.ndarray | None:
+    """Where fingertips carry an object that is lowered between them at `place` [3] m; None: nowhere, or no room."""
+    up = -scene.model.opt.gravity / GRAVITY
+    positions = [place + step * _STEP * up for step in range(-_STEPS, _STEPS)]
+    clear = [is_clear(scene, data, position, quat) for position in positions]
+    top = next((k for k in range(_STEPS, 2 * _STEPS) if clear[k]), None)
+    below = None if top is None else next((k for k in range(top - 1, -1, -1) if not clear[k]), None)
+    return None if below is None else positions[below + 1]
+
+
+def is_clear(scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray) -> bool:
+    """Whether the object has room at a pose, with the joints as they are in `data`."""
+    put(scene, data, position, quat)
+    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_collision(scene.model, data)
+    touching = scene.is_object[data.contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
+    return bool(np.all(data.contact.dist[touching] > -_OVERLAP))
+
+
+def put(scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: object = 0.0) -> None:
+    """Set the object's pose, and its velocity [3] m/s."""
+    at, dof = scene.object_qpos, scene.object_dof
+    data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = position, quat
+    data.qvel[dof : dof + 3], data.qvel[dof + 3 : dof + 6] = velocity, 0.0

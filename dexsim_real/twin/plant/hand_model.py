@@ -6,7 +6,7 @@ fingertip is the site on the body that the finger's last joint moves. The motors
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -47,21 +47,14 @@ def own_model(hand: Hand) -> HandModel:
     spec = read_mjcf(hand)
     spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
     tips = [hand.body_names[body] for body in hand.tip_body]
-    for tip in tips:
-        spec.body(tip).add_site(name=f"{tip}_taxels")
-    spec, lattices = _in_palm_frame(spec, (np.zeros(3), np.eye(3))), _prefixed(f"{tip}_taxels" for tip in tips)
-    return HandModel("emulated hand", spec, _prefixed(hand.joint_names), hand.torque_limit, lattices)
+    lattices = [spec.body(tip).add_site(name=f"{tip}_taxels").name for tip in tips]
+    return _in_palm_frame("emulated hand", spec, (np.zeros(3), np.eye(3)), hand, hand.joint_names, lattices)
 
 
 def read_model(path: str | Path, hand: Hand) -> HandModel:
-    """Read and check an MJCF by somebody else.
+    """Read and check an MJCF by somebody else; `hand` is the one whose joints, fingertips and taxels it must have.
 
-    Args:
-      path: the MJCF.
-      hand: whose joints, fingertips and taxels it must have.
-
-    Raises:
-      HandError: it cannot be read, or does not fit the hand.
+    Raises HandError: it cannot be read, or does not fit the hand.
     """
     path = Path(path)
     try:
@@ -78,28 +71,29 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: {' '.join(str(error).split())[:300]}") from None
     lattices = _add_lattices(spec, data, hand, palm, tips)
-    _delete(spec, *spec.actuators)
-    spec, drives = _in_palm_frame(spec, palm), _prefixed(model.joint(joint).name for joint in joints)
-    return HandModel(path.name, spec, drives, hand.torque_limit, _prefixed(lattices), foreign=True)
+    for actuator in spec.actuators:
+        spec.delete(actuator)
+    names = [model.joint(joint).name for joint in joints]
+    return _in_palm_frame(path.name, spec, palm, hand, names, lattices, foreign=True)
 
 
-def _in_palm_frame(spec: mujoco.MjSpec, palm: Pose) -> mujoco.MjSpec:
-    """The same model with its palm as the world's frame, and prefixed names."""
+def _in_palm_frame(
+    name: str,
+    spec: mujoco.MjSpec,
+    palm: Pose,
+    hand: Hand,
+    joints: Sequence[str],
+    lattices: list[str],
+    foreign: bool = False,
+) -> HandModel:
+    """The model with its palm as the world's frame, and prefixed names."""
     place, turn = palm
     quat, world = np.empty(4), mujoco.MjSpec()
     mujoco.mju_mat2Quat(quat, turn.T.ravel())
     world.option = spec.option
     world.attach(spec, frame=world.worldbody.add_frame(pos=-turn.T @ place, quat=quat), prefix=PREFIX)
-    return world
-
-
-def _prefixed(names: Iterable[str]) -> list[str]:
-    return [PREFIX + name for name in names]
-
-
-def _delete(spec: mujoco.MjSpec, *elements: object) -> None:
-    for element in elements:
-        spec.delete(element)
+    joints, lattices = ([PREFIX + name for name in names] for names in (joints, lattices))
+    return HandModel(name, world, joints, hand.torque_limit, lattices, foreign)
 
 
 # --- reading: ValueError where the file does not fit ---------------------------------------------
@@ -123,7 +117,9 @@ def _leave_out_scenery(spec: mujoco.MjSpec) -> None:
     floors = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     gone = {geom.name for geom in (*floors, *(g for body in loose for g in body.find_all("geom")))}
     pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & gone]
-    _delete(spec, *spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples, *pairs, *floors, *loose)
+    others = (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples)
+    for element in (*others, *pairs, *floors, *loose):
+        spec.delete(element)
 
 
 def _find_joints(model: mujoco.MjModel, hand: Hand) -> list[int]:
@@ -137,10 +133,8 @@ def _find_joints(model: mujoco.MjModel, hand: Hand) -> list[int]:
         joint = hinges[name]
         limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.array([-np.inf, np.inf])
         if np.abs(limits - (low, high)).max() > _RANGE:
-            raise ValueError(
-                f"joint {name} has a range of {limits[0]:.3f} to {limits[1]:.3f} rad, {end} of the hand {low:.3f} to "
-                f"{high:.3f}"
-            )
+            found, expected = f"{limits[0]:.3f} to {limits[1]:.3f} rad", f"{low:.3f} to {high:.3f}"
+            raise ValueError(f"joint {name} has a range of {found}, {end} of the hand {expected}")
     return [hinges[name] for name in names]
 
 
@@ -172,10 +166,8 @@ def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int)
     if len(sites) > 1:
         sites = [site for site in sites if "tip" in model.site(site).name.lower()]
     if len(sites) != 1:
-        raise ValueError(
-            f"{len(sites)} fingertip sites of {hand.finger_names[finger]}: put one site with 'tip' in its name on the "
-            f"body that {model.joint(joint).name} moves, at the tip"
-        )
+        where = f"put one site with 'tip' in its name on the body that {model.joint(joint).name} moves, at the tip"
+        raise ValueError(f"{len(sites)} fingertip sites of {hand.finger_names[finger]}: {where}")
     return sites[0]
 
 
@@ -190,10 +182,9 @@ def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Po
         apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - expected, axis=-1)
         if not apart.max() <= _APART:
             where = f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad" if j >= 0 else "all joints at 0"
-            raise ValueError(
-                f"with {where} the tip of {hand.finger_names[apart.argmax()]} is {1e3 * apart.max():.0f} mm from where "
-                "the hand has it: check palm frame, and order, axes and zeros of the joints"
-            )
+            tip = f"the tip of {hand.finger_names[apart.argmax()]} is {1e3 * apart.max():.0f} mm"
+            todo = "check palm frame, and order, axes and zeros of the joints"
+            raise ValueError(f"with {where} {tip} from where the hand has it: {todo}")
 
 
 def _hand_tips(hand: Hand, data: mujoco.MjData, posture: np.ndarray) -> Pose:

@@ -58,10 +58,6 @@ class Band:
         return (low + place.T * (high - low)).T
 
 
-def _symmetric(limit: float, unit: str, origin: str, per: str) -> Band:
-    return Band(-limit, limit, unit, origin, 0.0, per)
-
-
 BANDS: dict[str, Band] = {
     # --- the drive, per joint
     "stiffness": Band(0.8, 1.2, "1", "randomization.stiffness_factor", 1.0, "joint"),
@@ -78,14 +74,14 @@ BANDS: dict[str, Band] = {
     "latency_spread": Band(0.0, 0.005, "s", "randomization.latency_spread", 0.0, "joint", "high"),
     # --- the sensors of the hand
     "sensing_latency": Band(0.0, 0.02, "s", "randomization.sensing_latency", 0.0, "trial", "high"),
-    "encoder_bias": _symmetric(0.01, "rad", "randomization.encoder_bias", "joint"),
+    "encoder_bias": Band(-0.01, 0.01, "rad", "randomization.encoder_bias", 0.0, "joint"),
     "current_gain": Band(0.9, 1.1, "1", "randomization.torque_gain", 1.0, "joint"),
     "taxel_gain": Band(0.9, 1.1, "1", "randomization.taxel_gain", 1.0, "finger"),
     # --- the mount
-    "gravity_tilt": _symmetric(0.1, "rad", "randomization.gravity_tilt", "plane"),
+    "gravity_tilt": Band(-0.1, 0.1, "rad", "randomization.gravity_tilt", 0.0, "plane"),
     # --- the object and its contacts
     "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
-    "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
+    "com_offset": Band(-0.003, 0.003, "m", "objects.com_offset", 0.0, "axis"),
     "friction": Band(0.35, 1.1, "1", "", 0.8, sides="within"),  # rubber: dusty to clean
     "link_friction": Band(0.25, 1.0, "1", "", 0.5, sides="within"),  # plastic and painted metal
     "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
@@ -111,8 +107,8 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
     "rotate": {
         "mass": Band(0.06, 0.15, "kg", "objects.mass", 0.10),
         "edge": Band(0.050, 0.060, "m", "edge", 0.055),
-        "imu_bias": _symmetric(0.04, "rad", "sensing.orientation.bias", "axis"),
-        "imu_drift": _symmetric(0.0005, "rad/s", "sensing.orientation.drift", "trial"),
+        "imu_bias": Band(-0.04, 0.04, "rad", "sensing.orientation.bias", 0.0, "axis"),
+        "imu_drift": Band(-0.0005, 0.0005, "rad/s", "sensing.orientation.drift", 0.0, "trial"),
         "imu_delay": Band(0.0, 0.02, "s", "sensing.orientation.delay", 0.0, "trial", "high"),
     },
 }
@@ -181,11 +177,6 @@ class TrialParameters:
         return value if value.ndim else float(value)
 
 
-def bands(task: str) -> dict[str, Band]:
-    """All bands of a task, by name."""
-    return BANDS | TASK_BANDS[task]
-
-
 def sample_trial(
     task: str,
     rng: np.random.Generator,
@@ -193,16 +184,9 @@ def sample_trial(
     overrides: Mapping[str, float] | None = None,
     hand: Hand | None = None,
 ) -> TrialParameters:
-    """Sample the parameters of a trial.
-
-    Args:
-      hand: gives the number of joints and fingers; None is the XHand.
-      overrides: by name a value, the same for all joints, fingers or axes.
-
-    Raises:
-      HandError: there is no such parameter.
-    """
-    table, given = bands(task), overrides or {}
+    """Sample the parameters of a trial. `hand` gives the number of joints and fingers, None is the XHand; `overrides`
+    by name a value, the same for all joints, fingers or axes. HandError: there is no such parameter."""
+    table, given = BANDS | TASK_BANDS[task], overrides or {}
     if unknown := sorted(given.keys() - table.keys() - STRUCTURE.keys()):
         known = ", ".join(sorted(table | STRUCTURE))
         raise HandError(f"the emulated hand has no parameter {unknown[0]!r}; choose from {known}")

@@ -68,13 +68,8 @@ class Look(NamedTuple):
 class Referee:
     """Follows one trial from release to end.
 
-    Args:
-      task: "grasp", "rotate", ...
-      reference: [3] m, nominal position of the object.
-      axis: [3] of the rotation.
-      seconds: time limit; None is that of the task.
-      fingers: their number.
-      thumb_side: the hand's; the goals of a left hand are those of its mirror image.
+    `reference` [3] m is the nominal position of the object, `axis` [3] that of the rotation, `seconds` the time limit
+    (None: the task's); the goals of a left hand, by its `thumb_side`, are those of its mirror image.
     """
 
     def __init__(
@@ -167,20 +162,13 @@ class Referee:
         its torque limit.
         """
         lived, count = max(self.time, 1e-9), max(self._counted, 1)
-        report: dict[str, Any] = {
-            "seconds": round(self.time, 4),
-            "end": self.end or "running",
-            "joint_speed": round(self._speed / lived, 4),
-        }
+        speed = round(self._speed / lived, 4)
+        report: dict[str, Any] = {"seconds": round(self.time, 4), "end": self.end or "running", "joint_speed": speed}
         if self.end.startswith("dropped") and self._looks:
             before = next(look for time, look in self._looks if time >= self.time - _LEAD)
-            poses = {
-                "joint_position": before.joint_position,
-                "object_position": before.position,
-                "object_quat": before.quat,
-                "finger_force": before.force,
-            }
-            report["before"] = {name: np.round(value, 4).tolist() for name, value in poses.items()}
+            names = ("joint_position", "object_position", "object_quat", "finger_force")
+            poses = (before.joint_position, before.position, before.quat, before.force)
+            report["before"] = {name: np.round(pose, 4).tolist() for name, pose in zip(names, poses, strict=True)}
         if self.task == "grasp":
             return report | {
                 "held": self.end == "time limit",

@@ -6,7 +6,7 @@ cones; rubber fingertips also have torsional friction. A foreign hand keeps the 
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -35,12 +35,11 @@ class Scene:
     """A compiled model and its indices; J joints in the order of the hand, F fingers."""
 
     def __init__(self, model: mujoco.MjModel, hand: HandModel):
-        drives = [model.joint(name) for name in hand.joints]
-        plays = [model.joint(f"{name}_play") for name in hand.joints]
-        free = model.joint("object")
+        free, hinges = model.joint("object"), [hand.joints, [f"{name}_play" for name in hand.joints]]
         self.model = model
-        self.drive_qpos, self.drive_dof = _addresses(drives)  # each [J]
-        self.play_qpos, self.play_dof = _addresses(plays)
+        drives, plays = (np.array([model.joint(name).id for name in names]) for names in hinges)
+        self.drive_qpos, self.drive_dof = model.jnt_qposadr[drives], model.jnt_dofadr[drives]  # each [J]
+        self.play_qpos, self.play_dof = model.jnt_qposadr[plays], model.jnt_dofadr[plays]
         self.object_qpos, self.object_dof = int(free.qposadr[0]), int(free.dofadr[0])  # first of seven, of six
         self.object_body = model.body("object").id
         self.tip_site = np.array([model.site(name).id for name in hand.lattices])  # [F] frames of the taxels
@@ -58,10 +57,6 @@ class Scene:
             follower, drive = model.jnt_qposadr[[model.eq_obj1id[index], model.eq_obj2id[index]]]
             offset, ratio = model.eq_data[index, :2]
             data.qpos[follower] = model.qpos0[follower] + offset + ratio * (data.qpos[drive] - model.qpos0[drive])
-
-
-def _addresses(joints: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([joint.qposadr[0] for joint in joints]), np.array([joint.dofadr[0] for joint in joints])
 
 
 def build_scene(hand: HandModel, parameters: TrialParameters, shape: ObjectShape, gravity: np.ndarray) -> Scene:

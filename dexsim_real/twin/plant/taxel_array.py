@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from dexsim.hand.description import Hand
+from dexsim_real.twin.plant.hand_model import Pose
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import TipContact
 from dexsim_real.twin.plant.shapes import ObjectShape
@@ -26,9 +27,7 @@ _FROM_NEIGHBOURS = np.array([[0.0, 1, 0], [1, -4, 1], [0, 1, 0]])[None, :, :, No
 class EmulatedTaxels:
     """The taxels of all fingertips; F fingers, N taxels each.
 
-    Args:
-      hand: whose lattice it is.
-      by_point: distribute loads around the points of the contacts, not by the squeezed rubber.
+    With `by_point` loads are distributed around the points of the contacts, not by the squeezed rubber.
     """
 
     def __init__(self, hand: Hand, *, by_point: bool = False):
@@ -50,20 +49,10 @@ class EmulatedTaxels:
         self._drift = parameters.taxel_drift * rng.standard_normal(shape)
 
     def load(
-        self,
-        shape: ObjectShape,
-        place: np.ndarray,
-        turn: np.ndarray,
-        tips: tuple[np.ndarray, np.ndarray],
-        contacts: list[TipContact],
+        self, shape: ObjectShape, place: np.ndarray, turn: np.ndarray, tips: Pose, contacts: list[TipContact]
     ) -> np.ndarray:
-        """Forces [F, N, 3] N on the taxels along their own axes, without imperfections.
-
-        Args:
-          shape, place, turn: of the object, with its position [3] m and rotation [3, 3].
-          tips: positions [F, 3] and rotations [F, 3, 3] of the fingertips' frames.
-          contacts: of object and fingertips.
-        """
+        """Forces [F, N, 3] N on the taxels along their own axes, without imperfections: of an object at a position
+        [3] m and with a rotation [3, 3], fingertips with these frames, and their contacts."""
         force = np.zeros((*self._area.shape, 3))
         for finger in {contact.finger for contact in contacts}:
             origin, frame = tips[0][finger], tips[1][finger]

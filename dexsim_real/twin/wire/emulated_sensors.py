@@ -16,7 +16,7 @@ from dexsim_real.sensors.camera import CameraConfig, camera_axes, encode_mask
 from dexsim_real.sensors.imu import UPRIGHT_X, encode
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import Primitive, matrix, product, turn
-from dexsim_real.twin.wire.line import Terminal
+from dexsim_real.twin.wire.firmware import Terminal
 
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 PICTURE = (640, 480)  # px, columns and rows
@@ -106,8 +106,7 @@ class EmulatedImu:
 class EmulatedCamera:
     """The emulated camera, and the program that sends its masks to the client of a socket; called as `EmulatedImu`.
 
-    Raises:
-      HandError: the socket cannot be created.
+    Raises HandError: the socket cannot be created.
     """
 
     def __init__(self, path: Path, plant: EmulatedHand, seed: int, start: float):
@@ -121,10 +120,8 @@ class EmulatedCamera:
             self._server.bind(str(path))
         except OSError as error:
             self._server.close()
-            raise HandError(
-                f"{path}: the socket for masks cannot be created ({error.strerror or error}); remove the file, or "
-                "choose another --folder"
-            ) from None
+            why = error.strerror or error
+            raise HandError(f"{path}: the socket for masks cannot be created ({why}); remove the file") from None
         self._server.listen()
         self._server.setblocking(False)
 
@@ -145,9 +142,7 @@ class EmulatedCamera:
         if self._client is None:
             return
         if not self._waiting:
-            mask = picture(self._plant, CameraConfig())
-            if self._rng.random() < _LOST:
-                mask[:] = False
+            mask = picture(self._plant, CameraConfig()) & (self._rng.random() >= _LOST)
             self.sent += 1
             self._waiting = encode_mask(now, mask)
         try:

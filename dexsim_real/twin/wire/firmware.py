@@ -1,17 +1,27 @@
-"""The emulated palm board: action and answer for each command.
+"""The emulated palm board: action and answer for each command, and the bytes' time on the line.
 
 Answers have the layouts of `dexsim_real.wire.frames`. It has the commands that the bridge sends, and refuses others. No
 public source describes the meaning of the error bits: they are defined here.
+
+An exchange takes as long as on the real hand: the bytes of the request at 3 Mbaud, a delay in the palm board, and the
+bytes of the answer, forwarded in chunks like a USB adapter does: 9.6 ms. The constants are measured on a hand (mean
+9.60 ms, 95 % below 9.63 ms, maximum 10.7 ms).
 """
 
+import contextlib
+import os
+import tty
+from collections import Counter, deque
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, PlantMeasurement
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode, passive_command
-from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
+from dexsim_real.wire.frames import Command, Frame, Mode, Parser, passive_command
+from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, LinkConfig
 
 OVERHEATED = 1
 """Error bit of a joint, defined by this board: too hot and off."""
@@ -25,14 +35,15 @@ _ID, _PARAMETER, _MODE, _FORCE_MODE = 1, 30, 67, 81  # numbers of refusals
 _ERROR_BASE = 1501000
 _ADDRESS = frames.palm_address(0)
 
+PROCESSING, JITTER = 0.00120, 0.00002  # s from a request's last byte to its answer's first: mean, standard deviation
+EXTRA_DELAY, EXTRA_PROBABILITY = 0.0011, 0.01  # s, largest extra delay of an exchange; how often there is one
+CHUNK = 510  # bytes that the adapter forwards at once
+_SILENCE = 0.003  # s without a byte after which an incomplete request is dropped
+_on_wire = LinkConfig().on_wire
+
 
 class Firmware:
-    """Executes frames on a plant.
-
-    Args:
-      plant: the physics.
-      note: called with one line when the motors turn on or off.
-    """
+    """Executes frames on a plant; `note` is called with one line when the motors turn on or off."""
 
     def __init__(self, plant: EmulatedHand, note: Callable[[str], None] = lambda text: None):
         self.plant, self._note = plant, note
@@ -50,8 +61,7 @@ class Firmware:
         """Execute a frame and return the answer; None for a frame addressed to another hand."""
         if frame.target not in (_ADDRESS, frames.BROADCAST):
             return None
-        command = Command(frame.command)
-        result = self._execute(command, frame.data)
+        command, result = frame.command, self._execute(Command(frame.command), frame.data)
         if isinstance(result, int):
             command, result = Command.ERROR, (_ERROR_BASE + result).to_bytes(4, "little")
         return Frame(_ADDRESS, frame.source, command, result)
@@ -108,3 +118,106 @@ def _whole(values: np.ndarray, kind: type) -> np.ndarray:
     """Rounded and clipped to the range of an integer type."""
     span = np.iinfo(kind)
     return np.clip(np.round(values), span.min, span.max).astype(kind)
+
+
+class Terminal:
+    """A pseudo-terminal; `name` is a link to it.
+
+    Raises HandError: something else has this name, or no terminal can be created.
+    """
+
+    def __init__(self, link: Path):
+        self.name = Path(link)
+        self._master = self._slave = -1
+        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
+        if self.name.exists() and not ours:
+            raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
+        try:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            # Renamed into place, so that the link changes atomically.
+            fresh = self.name.with_name(f".{self.name.name}.{os.getpid()}")
+            fresh.symlink_to(os.ttyname(self._slave))
+            fresh.replace(self.name)
+        except OSError as error:
+            self.close()
+            raise HandError(f"{self.name}: no pseudo-terminal can be created here ({error.strerror})") from None
+
+    def close(self) -> None:
+        """Disconnect: programs that have the terminal open get an error."""
+        if self._master >= 0:
+            with contextlib.suppress(OSError):
+                if os.readlink(self.name) == os.ttyname(self._slave):
+                    self.name.unlink()
+            os.close(self._master)
+            os.close(self._slave)
+        self._master = self._slave = -1
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        """Received bytes; empty if there are none."""
+        try:
+            return os.read(self._master, 65536)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; what nobody reads is lost, as on a wire."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
+
+
+class HandLine:
+    """Serves one terminal. It has no clock: call `serve` with the time, often, and whenever `due` has passed.
+
+    `catch_up` is called with a time in s before the hand acts, to advance the plant to that time; `seed` is of delays.
+    """
+
+    def __init__(self, terminal: Terminal, firmware: Firmware, catch_up: Callable[[float], None], seed: int = 0):
+        self.terminal, self.firmware, self._catch_up = terminal, firmware, catch_up
+        self.counts: Counter[str] = Counter()
+        self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
+        self._tasks: deque[tuple[float, Frame | bytes]] = deque()  # when (s): a request to execute, bytes to send
+        self._heard = -np.inf
+
+    def due(self) -> float:
+        """Time s at which `serve` must be called at the latest; infinite while it can only wait for a request."""
+        return self._tasks[0][0] if self._tasks else np.inf
+
+    def serve(self, now: float) -> None:
+        """Do what is due."""
+        data, rng = self.terminal.read(), self._rng
+        if not data and now - self._heard > _SILENCE:
+            self._parser.expire()
+        self._heard = now if data else self._heard
+        for frame in self._parser.feed(data):
+            self.counts["requests"] += 1
+            if self._tasks:  # It cannot listen and talk on one pair of wires.
+                self.counts["ignored"] += 1
+                continue
+            extra = rng.uniform(0.0, EXTRA_DELAY) if rng.random() < EXTRA_PROBABILITY else 0.0
+            delay = max(PROCESSING + JITTER * rng.standard_normal(), 0.0) + extra
+            self._tasks.append((now + _on_wire(len(frame.encode())) + delay, frame))
+        while self._tasks and self._tasks[0][0] <= now:
+            due, task = self._tasks.popleft()
+            if isinstance(task, Frame):
+                self._execute(task, due, now)
+            else:
+                self.terminal.write(task)
+
+    def _execute(self, request: Frame, due: float, now: float) -> None:
+        """Execute a request that was due at a time, and plan the bytes of its answer."""
+        self._catch_up(now)
+        answer = self.firmware.answer(request)
+        if answer is None:
+            return
+        data = answer.encode()
+        # From when it was due: a late machine catches up during the transfer.
+        start = max(due, now - _on_wire(len(data)) / 2)
+        self.counts["answers"] += 1
+        for begin in range(0, len(data), CHUNK):
+            chunk = data[begin : begin + CHUNK]
+            self._tasks.append((start + _on_wire(begin + len(chunk)), chunk))

@@ -12,8 +12,8 @@ from dexsim.core import cli
 from dexsim.core.errors import DexsimError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.__main__ import fit_and_report, main
-from dexsim_real.calibrate.options import PressConfig
-from dexsim_real.calibrate.read import read_presses
+from dexsim_real.calibrate.bench import PressConfig
+from dexsim_real.calibrate.press_fit import fit, read_presses
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
@@ -41,8 +41,10 @@ def test_options_that_do_not_go_together(tmp_path):
             arguments(tmp_path, **options)
 
 
-def test_nothing_is_overwritten_and_a_figure_that_fails_leaves_the_calibration(hand, session, tmp_path):
-    options, path = arguments(tmp_path), tmp_path / "hand.toml"
+def test_nothing_is_overwritten_and_a_figure_that_fails_leaves_the_calibration(hand, session, tmp_path, monkeypatch):
+    options, path, fitted = arguments(tmp_path), tmp_path / "hand.toml", fit(*read_presses([session[2]], hand), hand)
+    monkeypatch.setattr(calibrate, "read_presses", lambda *_: ((), ()))
+    monkeypatch.setattr(calibrate, "fit", lambda *_: fitted)
     path.write_text("precious")
     with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(session[2]))} fits these"):
         fit_and_report(options, hand, [session[2]], operator())  # It came while the hand was pressing.
@@ -88,25 +90,25 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
     assert not output.exists()
 
 
-def changed(source, path, **values):
-    """A log with another configuration."""
-    with LogWriter(path) as log:
-        for entry in LogReader(source):
-            meta = entry.kind == Kind.META and "task" in entry.content
-            log.add(entry.kind, {**entry.content, **values} if meta else entry.content, entry.time)
-    return path
-
-
 def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session, tmp_path):
-    hardware = next(entry.content["hardware"] for entry in LogReader(session[2]) if entry.kind == Kind.META)
+    """By what they begin with."""
+    meta = next(entry.content for entry in LogReader(session[2]) if entry.kind == Kind.META)
+    hardware = meta["hardware"]
+
+    def log_of(name, **values):
+        with LogWriter(tmp_path / name) as log:
+            log.add(Kind.META, meta | values)
+        return log.path
+
+    ours = log_of("ours")
     for values, says in (
         ({"rate": 82.0}, "another --rate than the logs before: 82.0"),
         ({"hardware": {**hardware, "taxel_floor": 2.0}}, "another --hardware options than the logs before"),
-        ({"serial": "2R32OTHER"}, "another hand than the logs before: .*2R32OTHER"),
+        ({"identity": ("2R32OTHER", "right")}, "another hand than the logs before: .*2R32OTHER"),
         ({"task": "grasp"}, "this is a log of 'grasp'; give one of 'calibrate'"),
     ):
         with pytest.raises(LogError, match=says):
-            read_presses([session[2], changed(session[2], tmp_path / f"{list(values)[0]}.log", **values)], hand)
+            read_presses([ours, log_of(f"{list(values)[0]}.log", **values)], hand)
     for name, kind, content, says in (
         ("early", Kind.NOTE, "end: no answer", "ends before the hand was ready"),
         ("forged", Kind.META, {"task": "calibrate"}, "KeyError"),

@@ -14,7 +14,7 @@ from paths import ROOT
 
 from dexsim.calibration.maps import load_calibration, torque_constants
 from dexsim_real.calibrate.__main__ import fit_and_report
-from dexsim_real.calibrate.options import PressConfig
+from dexsim_real.calibrate.bench import PressConfig
 
 
 def torque_of(plant, joint):

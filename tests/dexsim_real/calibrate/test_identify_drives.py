@@ -12,8 +12,8 @@ from press_bench import BenchHand
 from dexsim.calibration.maps import save_calibration
 from dexsim.core.errors import CalibrationError
 from dexsim_real.calibrate import identify_drives
+from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.calibrate.identify_drives import identify_hand, joint_log, read_joints, record
-from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.twin.virtual import ideal_calibration

@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim_real.calibrate.plan import placements
+from dexsim.hand.load import load_hand
+from dexsim_real.calibrate.procedure import placements
 from dexsim_real.core.errors import HandError
 
 
@@ -30,3 +31,10 @@ def test_every_joint_is_pressed_with_and_every_press_goes_outward(hand):
     assert {p.name for p in placements(hand, ("thumb",), sides=False)} == {"thumb pad"}
     with pytest.raises(HandError, match="no finger 'toe'"):
         placements(hand, ("toe",))
+
+
+def test_the_left_hand_is_calibrated_by_the_same_presses(hand):
+    for one, other in zip(placements(hand), placements(load_hand("xhand_left")), strict=True):
+        assert (one.name, one.joints, one.task) == (other.name, other.joints, other.task)
+        np.testing.assert_array_equal(other.posture, one.posture)
+        np.testing.assert_allclose(other.direction, one.direction, atol=1e-5)

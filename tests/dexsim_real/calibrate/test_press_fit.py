@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from calibrating import QUICK, Typist, arguments, off, on, operator, plates, record
+from calibrating import Typist, arguments, off, on, operator, plates, record
 from press_bench import BenchHand
 
 from dexsim.calibration.maps import (
@@ -15,9 +15,8 @@ from dexsim.calibration.maps import (
 from dexsim.core.errors import CalibrationError
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
-from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.press_fit import dead_taxels, fill_dead, fit
-from dexsim_real.calibrate.read import read_presses
+from dexsim_real.calibrate.bench import CalibrateArguments
+from dexsim_real.calibrate.press_fit import dead_taxels, fill_dead, fit, read_presses
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 
 
@@ -107,10 +106,13 @@ def test_a_press_is_taken_from_the_last_log_that_finished_it(hand, session, tmp_
     assert not cut["index pad"].finished
     assert any(note.startswith("index pad: was interrupted") for note in fit(source, cut, hand)[0].notes)
     # One that was pressed again is the new one.
-    options = arguments(tmp_path, sides=False, press=QUICK, log=tmp_path / "again.log")
-    again = record(BenchHand(hand, plates(hand, "index pad")), hand, options)
-    both, new = (read_presses(logs, hand)[1] for logs in ([session[2], again], [again]))
-    assert both["index pad"].time[0] == new["index pad"].time[0] and both["index side"].finished
+    with LogWriter(tmp_path / "again") as log:
+        for entry in entries:
+            if entry.kind != Kind.TICK or entry.content["press"] != "index side":
+                log.add(entry.kind, entry.content, entry.time + 1000)
+    both = read_presses([session[2], log.path], hand)[1]
+    assert both["index pad"].time[0] == alone["index pad"].time[0] + 1000
+    assert both["index side"].time[0] == alone["index side"].time[0]
 
 
 def test_a_press_that_no_taxel_feels_is_left_out(hand, session, scale):

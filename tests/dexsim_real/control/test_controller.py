@@ -28,8 +28,8 @@ from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
 from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.sensors.object_sensors import ObjectEstimate
 from dexsim_real.wire import frames
 
 QUIET = Sensing(

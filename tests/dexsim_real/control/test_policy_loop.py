@@ -13,8 +13,8 @@ from dexsim_real.control import policy_loop
 from dexsim_real.control.controller import Tick
 from dexsim_real.control.policy_loop import TurnGoals
 from dexsim_real.control.safety import Reaction
+from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.imu import IDENTITY, ImuReader, encode
-from dexsim_real.sensors.object_sensors import ObjectEstimate
 
 
 class Still:
@@ -37,7 +37,7 @@ class Still:
 def test_a_silent_imu_is_held_within_a_third_of_a_second_then_relaxed(hand, silent):
     bench, imu = Bench(hand), ImuReader()
     objects = policy_loop.ObjectSensors(np.zeros(3), None, imu)
-    loop = policy_loop.PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach=0.0, place=0.0)
+    loop = policy_loop.PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach_seconds=0, place_seconds=0)
     imu.receive(bench.now, encode(0, IDENTITY))
     bench.engage()
     bench.cycle()

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim_real.core.timing import GRACE, Pace, keep_phase
-from dexsim_real.loop import LoopThread
+from dexsim_real.loop import GRACE, LoopThread, Pace, keep_phase
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 
 CYCLE = 0.012

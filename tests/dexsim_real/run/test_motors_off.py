@@ -87,7 +87,7 @@ def test_only_the_first_signal_interrupts():
 
 
 def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
-    """Interrupted while the cable is out: the motors go off when it returns, 2 s later. The guard lets it try."""
+    """Interrupted while the cable is out: the motors go off when it returns, a second later. The guard lets it try."""
     with FollowingHand() as peer:
         process = runner(peer, tmp_path, "--no-guard")
         try:
@@ -95,7 +95,7 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
             peer.close()
             time.sleep(0.2)
             process.send_signal(signal.SIGINT)
-            time.sleep(2.0)
+            time.sleep(1.0)
             assert process.poll() is None
             peer.open()
             asked = len(peer.commands)

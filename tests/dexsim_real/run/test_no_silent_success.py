@@ -69,7 +69,7 @@ def test_a_camera_that_is_lost(tmp_path):
     server = socket.socket(socket.AF_UNIX)
     server.bind(str(tmp_path / "masks"))
     server.listen()
-    mask = np.zeros((480, 640), bool)
+    mask = np.zeros((481, 643), bool)
     mask[230:250, 310:330] = True
 
     def show():

@@ -2,6 +2,7 @@
 
 import pytest
 
+from dexsim.hand.load import load_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
@@ -11,11 +12,11 @@ from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
 def trial(hand, controller_of):
     """The referee's report of one trial on a nominal hand."""
 
-    def trial(name, seconds, command=0.5):
+    def trial(name, seconds, command=0.5, hand=hand):
         controller = controller_of(load_policy(name), hand)
         controller.warm()
         task = controller.policy.task
-        plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape="sphere")
+        plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape_name="sphere")
         report = VirtualRun(plant, controller, ideal_calibration(hand), command).run()
         assert report["bridge"]["latched"] == "", report
         return report
@@ -28,6 +29,11 @@ def test_the_grasp_holds_and_presses_as_asked(trial):
     weak, strong = (trial("grasp", 3.0, command) for command in (0.0, 1.0))
     assert weak["held"] and strong["held"]
     assert strong["finger_force"] > weak["finger_force"] + 1.5, (weak["finger_force"], strong["finger_force"])
+
+
+def test_the_shipped_grasp_of_the_right_hand_holds_on_the_left_one(trial):
+    report = trial("grasp", 2.0, hand=load_hand("xhand_left"))
+    assert report["held"] and report["finger_force"] > 0.5
 
 
 @pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation"])

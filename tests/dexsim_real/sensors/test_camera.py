@@ -1,8 +1,6 @@
 """The object's height from masks, and the sources of masks."""
 
 import math
-import socket
-import threading
 import time
 
 import numpy as np
@@ -10,14 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import (
     CameraConfig,
     HeightSensor,
     camera_axes,
-    encode_mask,
     height_of,
-    open_masks,
 )
 
 REFERENCE = np.array([0.055, -0.005, 0.09])  # m
@@ -67,29 +62,6 @@ def test_velocity_is_filtered_as_in_the_simulation():
     np.testing.assert_allclose(position, REFERENCE + [0.028, 0, 0], atol=6e-4)
     assert velocity[0] == pytest.approx(0.004 / 0.03 * (1 - 0.5**7), rel=0.15) and not velocity[1:].any()
     sensor.close()
-
-
-def test_a_stream_of_masks_from_another_program(tmp_path):
-    path, config = str(tmp_path / "masks"), CameraConfig()
-    server = socket.socket(socket.AF_UNIX)
-    server.bind(path)
-    server.listen()
-
-    def serve():
-        link, _ = server.accept()
-        for k in range(5):
-            link.sendall(encode_mask(1.0 + k, picture(REFERENCE + [0.01 * k, 0, 0], config, shape=(481, 643))))
-        link.close()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    sensor = tracking(open_masks(f"unix:{path}", config))
-    thread.join()
-    assert until(lambda: sensor.has_measurement and sensor.read()[0] == 5.0)
-    assert sensor.read()[1][0] == pytest.approx(0.055 + 0.04, abs=6e-4)
-    sensor.close()
-    with pytest.raises(HandError, match="no program sends masks"):
-        open_masks(f"unix:{tmp_path}/none", config)
 
 
 def test_a_camera_that_ends_or_fails_says_so():

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from dexsim.geometry import rotations
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors import imu
+from dexsim_real.sensors.camera import ObjectSensors
 from dexsim_real.sensors.imu import IDENTITY
-from dexsim_real.sensors.object_sensors import ObjectSensors
 
 DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
 
@@ -61,10 +61,10 @@ def test_orientations_survive_the_wire(yaw, pitch, roll, index):
 )
 def test_the_imu_parser_recovers_from_noise(parts, size):
     stream = b"".join(parts) + 4 * DATASHEET
-    parser, found = imu.RvcParser(), []
+    parser, found = imu.make_parser(), []
     for at in range(0, len(stream), size):
         found += parser.feed(stream[at : at + size])
-        assert len(parser._buffer) <= imu.SIZE + size
+        assert parser.pending <= imu.SIZE + size
     # One in 256 false heads passes the checksum, and then takes the next frame's beginning with it.
     assert len(found) >= 3 and all(apart(quat, imu.decode(DATASHEET)) < 1e-6 for _, quat in found[-3:])
     if not parts:

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -18,29 +17,25 @@ from twin_plant import ScriptedPlant
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
-from dexsim_real.twin.__main__ import PlantClock
+from dexsim_real.twin.__main__ import SLICE, Twin, TwinArguments
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, SERIALS
 
 
-def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot():
-    class Slow(ScriptedPlant):
-        def advance(self, seconds):
-            super().advance(seconds)
-            time.sleep(pace * seconds)
-
-    notes, pace = [], 0.0
-    clock = PlantClock(Slow(), 10.0, notes.append)
+def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(tmp_path):
+    notes = []
+    twin = Twin(TwinArguments(), ScriptedPlant(), tmp_path, notes.append)
+    twin.now, plant = 10.0, twin.plant
     for now in np.arange(10.0, 10.5, 0.0007):
-        clock.catch_up(now, PlantClock.SLICE)
-    assert clock.plant.time == pytest.approx(0.5, abs=0.003) and clock.slipped == 0
+        twin.catch_up(now, SLICE)
+    assert plant.time == pytest.approx(0.5, abs=0.003) and twin.slipped == 0
     # Behind by less than the bound all of it is caught up, in slices; behind by more, the rest is let go.
     for _ in range(100):
-        clock.catch_up(10.58, PlantClock.SLICE)
-    assert clock.plant.time == pytest.approx(0.58, abs=1e-6)
-    clock.catch_up(13.0)
-    assert clock.plant.time == pytest.approx(0.59, abs=1e-6) and clock.slipped == pytest.approx(2.41, abs=1e-6)
+        twin.catch_up(10.58, SLICE)
+    assert plant.time == pytest.approx(0.58, abs=1e-6)
+    twin.catch_up(13.0)
+    assert plant.time == pytest.approx(0.59, abs=1e-6) and twin.slipped == pytest.approx(2.41, abs=1e-6)
     assert len(notes) == 1 and "too slow" in notes[0]
-    assert clock.plant.time + clock.slipped == pytest.approx(3.0, abs=1e-3)
+    twin.close()
 
 
 SCRIPTED = """

@@ -1,14 +1,11 @@
 """Runs in virtual time: the bridge's parts against the emulated hand, event by event."""
 
-import importlib.util
 import json
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from emulated_plant import free
-from paths import ROOT
 
 from dexsim.calibration.maps import normalised_torque
 from dexsim_ppo.policy import load_policy
@@ -16,7 +13,6 @@ from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.shapes import SHAPES, product
 from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera, virtual_imu
 
@@ -92,7 +88,7 @@ def test_the_camera_measures_the_height(hand):
     spec = load_policy("grasp").spec
     reference = np.array(spec.reference)
     for shape in SHAPES:
-        plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape=shape)
+        plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape_name=shape)
         port = VirtualPort(plant)
         camera = virtual_camera(port, spec)
         free(plant, reference + (0.01, 0.0, 0.0))
@@ -108,73 +104,3 @@ def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
     current = -0.5 * np.ones(12, np.float32)  # A, closing, half of what stalls
     assert np.asarray(normalised_torque(calibration, current)) == pytest.approx(np.full(12, 0.5), abs=1e-6)
     assert HardwareConfig().current_sign < 0
-
-
-# --- the benchmark's tables ----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def benchmark():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "benchmarks")
-        return SimpleNamespace(
-            **vars(importlib.import_module("zero_shot_metrics")) | vars(importlib.import_module("zero_shot"))
-        )
-
-
-def test_metrics_of_rotations(benchmark):
-    keys = ("successes", "paper_successes", "seconds_to_fall", "fell", "joint_speed")
-    rows = ((0, 1, 3.0, True, 0.5), (10, 11, 60.0, True, 0.5), (50, 51, 120.0, False, 0.5))
-    metrics = benchmark.rotate_metrics([dict(zip(keys, row, strict=True)) for row in rows])
-    assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
-    assert metrics["seconds_to_fall"]["mean"] == 61.0
-    assert metrics["successes_per_minute"]["mean"] == pytest.approx(60 / (183 / 60))  # stuck or not
-    assert metrics["kept_to_the_end"]["mean"] == pytest.approx(1 / 3)
-    text = benchmark.table(metrics, benchmark.simulated("rotate", "rotate"), {"successes": {"mean": 0.25}})
-    assert len(text.splitlines()) == 7 and text.splitlines()[1].endswith("0.25")
-
-
-def test_metrics_of_grasps_count_only_what_was_held(benchmark):
-    def report(c, shape, held):
-        forces = {"force": 2 + 5 * c, "normal": (1 + c) ** 2, "taxels": 1 - c}
-        report = {f"finger_{name}": value for name, value in forces.items()}
-        report |= {"total_force": 9 + c, "total_torque": 0.5 + c, "torque_limited": 0.6 * (c == 1)}
-        time = {"seconds": 8.0 if held else 5.5, "window_s": [3.0, 8.0]}
-        return report | time | {"held": held, "command": c, "shape": shape}
-
-    reports = [report(c, shape, held) for c in (0.0, 0.5, 1.0) for shape, held in (("box", True), ("sphere", c < 1))]
-    metrics = benchmark.grasp_metrics(reports, (2.0, 7.0))
-    assert metrics["held"]["mean"] == pytest.approx(5 / 6)
-    assert metrics["r_resultant"]["r"] == pytest.approx(1.0) and metrics["r_taxels"]["r"] == pytest.approx(-1.0)
-    command = np.array([0.0, 0.0, 0.5, 0.5, 1.0])
-    assert metrics["r_normal"]["r"] == pytest.approx(np.corrcoef(command, (1 + command) ** 2)[0, 1])
-    assert [row["held"]["mean"] for row in metrics["by_command"]] == [1.0, 1.0, 0.5]
-    assert [row["torque_limited"]["mean"] for row in metrics["by_command"]] == [0.0, 0.0, 0.6]
-    # The lost object was pressed as wanted, 7 N, for half of the window.
-    assert metrics["force_error_n"]["mean"] == pytest.approx(3.5 / np.sqrt(6))
-    assert benchmark.table(metrics, benchmark.simulated("grasp", "grasp"), {}).count("(saturates)") == 1
-
-
-def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):
-    torque = np.zeros(12)
-    torque[hand.root_joint] = (0.5, -0.3, 0.2, 0.1, 0.4)
-    measured = SimpleNamespace(finger_force=np.array([1.0, 2.0, 0.0, 3.0, 0.0]))
-    trace = [
-        {
-            "time": time,
-            "tick": SimpleNamespace(readings=SimpleNamespace(joint_torque=k * torque)),
-            "measured": measured,
-        }
-        for time, k in ((10.0, 9.0), (12.9, 9.0), (13.5, 1.0), (15.0, 2.0), (18.0, 9.0))
-    ]
-    assert benchmark._measured_torque(trace, hand, [3.0, 8.0]) == pytest.approx(1.5 * (0.5 + 0.3 + 0.1))
-    assert benchmark._measured_torque(trace[:2], hand, [3.0, 8.0]) == 0.0
-
-
-def test_both_worlds_name_forces_alike(benchmark):
-    """What the referee reports is what the task's report reduces, name by name."""
-    from dexsim.tasks.grasp.report import FORCES, window
-
-    judge = Referee("grasp", np.zeros(3), np.eye(3)[0])
-    assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
-    assert judge.window == window(judge.limit) == (3.0, 8.0)

@@ -3,22 +3,19 @@
 import jax
 import numpy as np
 import pytest
+from driver_bench import DriverBench
 from scripted_driver import ScriptedDriver
 from untrained import untrained
 
 from dexsim import load_hand
 from dexsim.observation import FIELDS, ObservationConfig, Readings, observe
 from dexsim_real.control.controller import NEEDS, Controller
-from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.control.safety import Reaction
 from dexsim_real.core.errors import HandError
-from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.driver import WITHOUT, DriverPort
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.link import LinkConfig
-
-PERIOD = 0.012  # s
 
 
 @pytest.fixture(scope="module")
@@ -176,18 +173,13 @@ def test_the_fields_that_depend_on_touch_and_current_are_those_of_the_table(hand
 @pytest.mark.parametrize("measures", [tuple(WITHOUT), ()])
 def test_without_currents_no_joint_counts_as_deaf_or_stalled(leap, measures):
     """A finger that stands far from its target: it draws nothing where that is measured, and may press otherwise."""
-    driver, clock = ScriptedDriver(leap, measures), [0.0]
-    port = opened(leap, driver, clock=lambda: clock[0])
-    safety = Safety(leap, SafetyConfig())
-    loop = ExchangeLoop(port, HandSensing(leap, HardwareConfig()), safety, 83.0, clock=lambda: clock[0])
-    target = driver.state.position + 0.5 * (np.arange(16) == 6)
-    for cycle in range(500):
-        clock[0] += PERIOD
-        if cycle == 20:
-            loop.engage()
-        # The other joints move, so the angles are not frozen.
-        driver.set(position=driver.state.position + 1e-3 * (np.arange(16) == 0) * (-1) ** cycle)
-        safety.set_target(target, clock[0])
-        loop.cycle()
+    driver = ScriptedDriver(leap, measures)
+    bench, joints = DriverBench(leap, driver), np.arange(16)
+    target = driver.state.position + 0.5 * (joints == 6)
+    bench.engage()
+    # The other joints move, so the angles are not frozen.
+    sway = lambda: driver.set(position=driver.state.position + 1e-3 * (joints == 0) * (-1) ** len(driver.sent))  # noqa: E731
+    bench.run(5.8, target, sway)
+    safety = bench.safety
     assert bool(safety.latched) == bool(measures) and ("does not follow" in safety.latched) == bool(measures)
     assert measures or safety.last[0] <= Reaction.CLIP

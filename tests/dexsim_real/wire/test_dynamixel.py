@@ -7,17 +7,13 @@ from hypothesis import strategies as st
 
 pytest.importorskip("serial")
 import dynamixel_bus
+from driver_bench import DriverBench
 from dynamixel_bus import DynamixelBus, status
 
 from dexsim import load_hand
-from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.loop import ExchangeLoop
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire.driver import DriverPort, JointTargets
-from dexsim_real.wire.dynamixel import DynamixelHand, crc16, packet, take_answers
-from dexsim_real.wire.link import LinkConfig
+from dexsim_real.wire.driver import JointTargets
+from dexsim_real.wire.dynamixel import DynamixelHand, crc16, make_parser, packet
 
 IDS = [12, 13, 14, 15, 1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11]
 TICK = 2 * np.pi / 4096
@@ -60,10 +56,9 @@ def test_packets_are_those_of_the_manual():
 )
 def test_answers_are_found_between_noise_in_pieces_of_any_size(contents, noise, size):
     """Contents full of halves of headers; the answers were stuffed by other code."""
-    stream, buffer, found = b"".join(noise + status(3, 0, data) for data in contents), bytearray(), []
+    stream, parser, found = b"".join(noise + status(3, 0, data) for data in contents), make_parser(), []
     for at in range(0, len(stream), size):
-        buffer += stream[at : at + size]
-        found += take_answers(buffer)
+        found += parser.feed(stream[at : at + size])
     assert [answer.data for answer in found] == contents
 
 
@@ -131,31 +126,19 @@ def test_ids_that_no_bus_can_have_are_refused(ids):
 
 
 def test_the_bridge_over_the_bus_reaches_a_target_and_stops_at_a_motor_that_shuts_down(bus, driver):
-    hand, clock = load_hand("leap_like"), [0.0]
-    port = DriverPort(driver, hand, LinkConfig(), clock=lambda: clock[0])
-    sensing = HandSensing(hand, HardwareConfig(kp=(600,), kd=(200,), current_sign=1.0))
-    safety = Safety(hand, SafetyConfig())
-    loop = ExchangeLoop(port, sensing, safety, 83.0, clock=lambda: clock[0], sleep=lambda seconds: None)
-    port.connect()
-    goal = np.clip(0.4, hand.joint_lower, hand.joint_upper) - 0.05
-
-    def run(cycles):
-        for _ in range(cycles):
-            clock[0] += 0.012
-            safety.set_target(goal, clock[0])
-            loop.cycle()
-
-    run(15)
-    loop.engage()
-    run(10)
+    hand = load_hand("leap_like")
+    bench = DriverBench(hand, driver, kp=(600,), kd=(200,), current_sign=1.0)
+    safety, goal = bench.safety, np.clip(0.4, hand.joint_lower, hand.joint_upper) - 0.05
+    bench.engage()
+    bench.run(0.1, goal)
     assert 0 < bus.get(12, 84, 2) < 600, "stiffness grows"
-    run(150)
+    bench.run(1.8, goal)
     assert bus.get(12, 84, 2) == 600
     np.testing.assert_allclose(safety.sample.measured.joint_position, goal, atol=0.04)
     bus.table[6][70] = 0x20  # overload: the motor shuts down, and its answers have the alert bit
     bus.table[6][64] = 0
-    run(40)
+    bench.run(0.5, goal)
     assert "error bits 0x0020" in safety.latched and "joint middle_pip" in safety.latched
     assert not any(table[64] for table in bus.table.values())
-    loop.close()
-    assert not loop.driven
+    bench.loop.close()
+    assert not bench.loop.driven

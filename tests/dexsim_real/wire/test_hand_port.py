@@ -14,7 +14,6 @@ from dexsim import load_hand
 from dexsim_real.core.errors import HandError, explain
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.wire.frames import Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 serial = pytest.importorskip("serial")
@@ -97,9 +96,3 @@ def test_the_latency_timer(tmp_path):
     assert f"echo 1 | sudo tee {timer}" in text and "16 ms" in text
     timer.write_text("1\n")
     assert port.warnings(tmp_path) == SerialHand("/dev/ttyACM0").warnings(tmp_path) == []
-
-
-def test_the_deadline_follows_size_and_baud():
-    # 297 + 2217 bytes of ten bits at 3 Mbaud are 8.38 ms.
-    assert LinkConfig(margin=0.001).deadline(297, 2217) == pytest.approx(0.00838 + 0.001, abs=1e-5)
-    assert LinkConfig(baud=115200, margin=0.001).deadline(297, 2217) == pytest.approx(0.2192, abs=1e-4)

@@ -16,7 +16,7 @@ from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.identity import Identity, check_identity, read_identity
+from dexsim_real.wire.link import Identity, check_identity, read_identity
 from dexsim_real.wire.serial_hand import SerialHand
 
 OURS = Identity("2R32A001", "right")

@@ -8,8 +8,7 @@ from emulated_plant import IDEAL, QUIET, free, motors
 from dexsim.core.assets import asset_path
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand
-from dexsim_real.twin.plant.assistant import GRAVITY, Stage
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.emulated_hand import GRAVITY, EmulatedHand, Stage
 from dexsim_real.twin.plant.hand_model import read_model
 from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import TipContact
@@ -33,7 +32,7 @@ def write(tmp_path):
 def plant(hand, path=None, task="rotate", shape=None, **overrides):
     path, values = path or asset_path("plants/foreign_right.xml"), QUIET | IDEAL | overrides
     values |= {"push_rate": 0.0, "sensing_latency": 0.0}
-    return EmulatedHand(hand, task, 0, kind="nominal", overrides=values, shape=shape, plant_model=path)
+    return EmulatedHand(hand, task, 0, kind="nominal", overrides=values, shape_name=shape, plant_model=path)
 
 
 def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):

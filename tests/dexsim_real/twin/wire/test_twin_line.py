@@ -12,7 +12,7 @@ from twin_pair import Cable, Running, command, request
 from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.line import Terminal
+from dexsim_real.twin.wire.firmware import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
 from dexsim_real.wire.link import LinkConfig
