@@ -410,8 +410,7 @@ def start_of(hand: Hand, task: str) -> Start:
         if hand.num_joints != len(CLEAR_POSTURE):
             raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
         mirror = np.array((1.0, hand.thumb_side, 1.0))
-        reference, place = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE
-        return Start(np.array(CLEAR_POSTURE), reference, place, np.array(CLEAR_AXIS))
+        return Start(np.array(CLEAR_POSTURE), mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array(CLEAR_AXIS))
     if skill_of(task) == "grasp":
         posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
         place = np.array(reference[1:])
