@@ -68,10 +68,10 @@ def still_moment(hand, position, **changes):
 
 
 def reset_to(env):
-    """`reset_to(key, index, goal=None)`: a new episode from a row of the pool."""
+    """`reset_to(key, index, goal=None)`: a new episode from a row of the pool, with ranges of full width."""
 
     def reset(key, index, goal=None):
-        return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal)
+        return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal, jnp.ones(()))
 
     return reset
 

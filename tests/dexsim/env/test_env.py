@@ -228,7 +228,8 @@ class TestEpisodes:
 
     def test_a_random_clock_is_uniform(self, grasp_env, history):
         state, limit = history[0][0], grasp_env.task.episode_ticks
-        draw = jax.vmap(lambda key: grasp_env.randomize_episode_time(row(state, 0), key).tick)
+        first = row(state, 0)
+        draw = jax.jit(jax.vmap(lambda key: grasp_env.randomize_episode_time(first, key).tick))
         assert np.histogram(draw(jax.random.split(jax.random.key(6), 4000)), 4, (0, limit))[0].min() > 850
 
     def test_restart_touches_only_what_is_done(self, grasp_env, grasp_rollout, history):
@@ -251,6 +252,53 @@ class TestEpisodes:
         # The object goes with its start.
         at = np.flatnonzero((np.asarray(grasp_env.pool.qpos) == ours[".physics.qpos"][0]).all(1))[0]
         np.testing.assert_array_equal(begun.episode.object.size[0], grasp_env.pool.object.size[at])
+
+    def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(self, hand, grasp_env, grasp_rollout, history):
+        """Only what is done is drawn; sizes stay as the pool has them."""
+        state, done = history[-1][2], np.arange(WORLDS) < 6
+        begun = grasp_rollout.restart(dataclasses.replace(state, scale=jnp.zeros(WORLDS)), jnp.asarray(done))
+        np.testing.assert_array_equal(begun.scale, 0.0)
+        assert_same(begun.episode, state.episode, ~done)
+        episode, objects = row(begun.episode, done), grasp_env.config.objects
+        for value, nominal in (
+            (episode.hand.actuator.stall_torque, hand.torque_limit),
+            (episode.hand.encoder_bias, 0),
+            (episode.hand.tilt, 0),
+            (episode.imu.bias, 0),
+            (episode.taxels["gain"], 1),
+            (episode.taxels["bias"], 0),
+            (episode.taxels["crosstalk"], 0),
+            (episode.taxels["alive"], True),
+            (episode.object.mass, np.mean(objects.mass)),
+            (episode.object.friction, np.mean(objects.friction)),
+            (episode.object.com, 0),
+            (episode.object.contact[:, 0], np.mean(objects.stiffness)),
+        ):
+            np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
+        assert len(np.unique(episode.object.contact[:, 1])) == 1
+        box = np.flatnonzero(np.asarray(episode.object.shape_index) == SHAPES.index("box"))
+        square = np.asarray(episode.object.size)[box, 0] ** 2
+        inertia = np.mean(objects.mass) / 3 * (square.sum(-1, keepdims=True) - square)
+        assert len(box) and np.ptp(inertia) > 0
+        np.testing.assert_allclose(episode.object.inertia[box], inertia, rtol=1e-4)
+
+    def test_an_object_is_held_until_it_is_let_go(self, grasp_env, grasp_rollout):
+        """For 0.1 s, four ticks; then it falls freely."""
+        state = grasp_rollout.reset(jax.random.key(3))
+        aside = state.physics.qpos.at[:, 13].add(1.0)
+        state = dataclasses.replace(
+            state,
+            physics=dataclasses.replace(state.physics, qpos=aside),
+            goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1)),
+        )
+        heights, still = [], state.key
+        for _ in range(7):  # the same chance in every tick: one without a push
+            state = grasp_rollout.step(dataclasses.replace(state, key=still), jnp.zeros((WORLDS, 12)))
+            heights.append(np.asarray(state.physics.qpos[:, 12]))
+        np.testing.assert_array_equal(heights[:4], [heights[0]] * 4)
+        steps = grasp_env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
+        fall = 0.5 * 9.81 * steps * (steps + 1) * grasp_env.config.physics.timestep**2
+        np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], WORLDS), rtol=0.02)
 
 
 class TestTrouble:

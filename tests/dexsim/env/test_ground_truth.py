@@ -20,24 +20,24 @@ FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="1
 
 
 @pytest.fixture(scope="module")
-def observer(simple_env):
+def observer(grasp_env):
     """Grasp's, whose critic also sees the object's orientation and spin."""
     critic = (*observation.GRASP, "object_orientation", "object_spin")
     task = SimpleNamespace(fields={"actor": observation.GRASP, "critic": critic})
-    return Observer(simple_env.config, simple_env.hand, task)
+    return Observer(grasp_env.config, grasp_env.hand, task)
 
 
 @pytest.fixture(scope="module")
-def seen(simple_env, observer):
+def seen(grasp_env, observer):
     """The object's velocity and spin as a task sees them, and the critic's observation, from a physics state."""
-    object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], simple_env.pool.object)
+    object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], grasp_env.pool.object)
     upright, joints, nothing = jnp.array([1.0, 0, 0, 0]), jnp.zeros(12), jnp.zeros(3)
     readings = Readings(
         joints, joints, jnp.zeros((5, 120)), nothing, nothing, upright, upright, jnp.float32(0.5), joints
     )
 
     def look(physics):
-        truth = ground_truth(simple_env, object, physics, jnp.zeros((5, 3)))
+        truth = ground_truth(grasp_env, object, physics, jnp.zeros((5, 3)))
         critic = observer.observe(readings, truth, (jnp.float32(0.5), upright))["critic"]
         return (truth.object_velocity, truth.object_spin), critic
 
