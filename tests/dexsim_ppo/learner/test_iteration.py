@@ -109,7 +109,7 @@ def test_actor_and_critic_are_each_clipped_to_the_norm(learner, long, short):
 
 
 def test_log_std_stays_between_floor_and_cap(learner):
-    learner = dataclasses.replace(learner, learning_rate=jnp.float32(1.0))
+    learner = learner._replace(learning_rate=jnp.float32(1.0))
     for sign, bound in ((1.0, UPDATES.std_min), (-1.0, UPDATES.std_max)):
         moved, grads = learner, jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), learner.params)
         for _ in range(5):
