@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from option_classes import OPTIONS
 from paths import ROOT
 
 from dexsim import registry
@@ -27,20 +28,6 @@ SHIPPED_PAGE = (ROOT / "docs" / "shipped.md").read_text()
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "docs" / "experiments" / "README.md"]
 USER_WORDS = 15_000
 """Limit of all pages for users: README and docs/*.md."""
-OPTIONS = {
-    "dexsim_ppo.train": "TrainArguments",
-    "dexsim_ppo.evaluate": "EvaluateArguments",
-    "dexsim_ppo.export": "ExportArguments",
-    "dexsim_ppo.record": "RecordArguments",
-    "dexsim_real.run": "options:RunArguments",
-    "dexsim_real.calibrate": "options:CalibrateArguments",
-    "dexsim_real.twin": "__main__:TwinArguments",
-    "dexsim_real.replay": "ReplayArguments",
-    "dexsim.check_hand": "CheckHandArguments",
-    "dexsim.import_hand": "ImportArguments",
-    "dexsim.view": "__main__:ViewArguments",
-}
-"""The class of every command's options; `dexsim_ppo.train` has one for each task."""
 
 
 def name_of(page: Path) -> str:
@@ -82,8 +69,7 @@ def check_command(line):
     elif module == "dexsim_ppo.train":
         parse_train(argv)
     else:
-        place, _, name = f"{module}.{OPTIONS[module]}".replace(":", ".").rpartition(".")
-        options = cli.parse(pkgutil.resolve_name(f"{place}:{name}"), argv, prog=module, description="")
+        options = cli.parse(pkgutil.resolve_name(OPTIONS[module][0]), argv, prog=module, description="")
         if getattr(options, "set", None):
             policy = load_policy(options.policy)
             config = from_dict(registry.find_task(policy.task).config_class, policy.env_config)

@@ -120,9 +120,7 @@ def test_gradients_in_a_pinch_are_finite_differences(linearized, moment):
         slope = WEIGHT @ linearized(moment, way)[1]
         np.testing.assert_allclose(slope, WEIGHT @ (ahead - behind) / 2, rtol=0.01, atol=1e-3 * way.max())
     _, slope = linearized(moment, np.float32([0, 0, 1, 0]))
-    assert (abs(WEIGHT @ slope) > 1e-6) == (moment[2] < 0.5), (
-        "contacts feel friction where they slip"
-    )
+    assert (abs(WEIGHT @ slope) > 1e-6) == (moment[2] < 0.5), "contacts feel friction where they slip"
 
 
 @pytest.mark.slow

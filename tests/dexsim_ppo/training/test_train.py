@@ -1,5 +1,6 @@
-"""The two commands on the tiny task: what they write, how they resume, how they refuse."""
+"""The two commands on the tiny task: what they write, how they resume and refuse, and how a diverging run ends."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -8,6 +9,7 @@ import threading
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_train
@@ -15,7 +17,7 @@ from tiny_env import TinyConfig, TinyEnv, make_env, make_evaluator
 from tiny_train import PER_ITERATION
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError, OtherEnvWarning
+from dexsim.core.errors import ConfigError, DexsimError, OtherEnvWarning
 from dexsim_ppo import checkpoint, evaluate, train
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.runlog import RunFolder, policy_of, read_metrics
@@ -203,3 +205,47 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys):
     assert code == 128 + signal.SIGTERM
     assert f"--resume {folder.path}" in capsys.readouterr().out.splitlines()[-1]
     assert folder.latest_checkpoint().exists()
+
+
+FAULTY = [*tiny_train.QUICK, *"--seed 3 --log-every 1".split()]
+GOOD_ITERATIONS = 3
+
+
+class Breaks(TinyEnv):
+    """From its 24th step on, the actors of environments that started on the right side observe NaN."""
+
+    def _start(self, key):
+        state = super()._start(key)
+        return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
+
+    def randomize_episode_time(self, state, key):
+        return state
+
+    def step(self, state, action):
+        age = state.metrics["age"] + 1
+        state = super().step(state, action)
+        broken = (age >= 8 * GOOD_ITERATIONS) & (state.target > 0.0)
+        actor = state.obs["actor"].at[1].set(jnp.where(broken, jnp.nan, state.obs["actor"][1]))
+        return dataclasses.replace(
+            state,
+            obs=state.obs | {"actor": actor},
+            truncated=jnp.bool_(False),
+            terminated=jnp.bool_(False),
+            metrics=state.metrics | {"age": age},
+        )
+
+
+def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch, capsys):
+    """By then the newest checkpoints hold the fault: only those up to the last sound iteration are named."""
+    tiny_train.install(monkeypatch, Breaks)
+    folder = RunFolder(tmp_path / "run")
+    options = ["--minutes", "5", "--run-dir", str(folder.path), "--checkpoint-every", "1", "--keep-checkpoints"]
+    with pytest.raises(DexsimError, match=f"after iteration {GOOD_ITERATIONS}; no checkpoint is from before"):
+        train.main([*FAULTY, *options, "3"])
+    shown = capsys.readouterr().out
+    assert f"iteration {GOOD_ITERATIONS + 1}: " in shown and "updates skipped" in shown
+    assert shown.count("gradient is not finite") == 1, "said when it begins"
+    assert min(int(path.stem) for path in folder.existing_checkpoints()) > GOOD_ITERATIONS
+    options[3] = str(tmp_path / "other")
+    with pytest.raises(DexsimError, match=f"newest checkpoint from before is .*{GOOD_ITERATIONS}.msgpack"):
+        train.main([*FAULTY, *options, "9"])
