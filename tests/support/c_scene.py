@@ -135,22 +135,21 @@ def start(model: mujoco.MjModel, qpos, qvel, warmstart=None) -> mujoco.MjData:
 
 
 def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray:
-    """Force of the object on each tip link [F, 3] N, world axes: a sum over `mj_contactForce`."""
-    total = np.zeros((hand.num_fingers, 3))
-    target = model.body("object").id
-    tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
+    """Force of the object on each tip link [F, 3] N, world axes."""
+    tips = [model.body(hand.body_names[body]).id for body in hand.tip_body]
+    return force_on(model, data, tips, model.body("object").id)
+
+
+def force_on(model: mujoco.MjModel, data: mujoco.MjData, tips, target: int) -> np.ndarray:
+    """Force of the body `target` on each of the bodies `tips` [F, 3] N, world axes: a sum over `mj_contactForce`."""
+    total, tips, wrench = np.zeros((len(tips), 3)), list(tips), np.zeros(6)
     for index, contact in enumerate(data.contact):
         first, second = model.geom_bodyid[contact.geom]
-        if target not in (first, second) or contact.exclude:
-            continue
-        wrench = np.zeros(6)
-        mujoco.mj_contactForce(model, data, index, wrench)
-        force = contact.frame.reshape(3, 3).T @ wrench[:3]  # from the first geom on the second
-        for finger, tip in enumerate(tips):
-            if second == tip:
-                total[finger] += force
-            elif first == tip:
-                total[finger] -= force
+        other = second if first == target else first
+        if contact.efc_address >= 0 and target in (first, second) and other in tips:
+            mujoco.mj_contactForce(model, data, index, wrench)
+            on_second = contact.frame.reshape(3, 3).T @ wrench[:3]
+            total[tips.index(other)] += on_second if other == second else -on_second
     return total
 
 

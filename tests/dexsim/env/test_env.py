@@ -153,14 +153,10 @@ class TestTick:
     def test_torque_readings_are_the_drives(self, hand, history):
         """The torque that the motors would give at the end of the tick, over the stall torque."""
         _, _, after = history[5]
-        for world in range(WORLDS):
-            torque = plain_drive(
-                c_scene.row(after.episode.hand.actuator, world),
-                np.asarray(after.joint_target[world]),
-                np.asarray(after.physics.qpos[world, :12]),
-                np.asarray(after.physics.qvel[world, :12]),
-            )
-            np.testing.assert_allclose(after.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
+        drive = c_scene.row(after.episode.hand.actuator, slice(None))
+        position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
+        torque = plain_drive(drive, np.asarray(after.joint_target), position, velocity)
+        np.testing.assert_allclose(after.joint_torque * hand.torque_limit, torque, atol=2e-5)
 
     def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
@@ -175,28 +171,19 @@ class TestTick:
 
 
 def plain_drive(drive, wanted, position, velocity):
-    """The paper's four equations and the ripple, joint by joint; the loop sees the encoder."""
-    torque = np.zeros(12)
-    for j in range(12):
-        error = wanted[j] - (position[j] + drive.encoder_bias[j])
-        if abs(error) < drive.dead_band[j]:
-            continue
-        limit = drive.stall_torque[j] * max(1 - abs(velocity[j]) / drive.no_load_speed[j], 0)
-        command = drive.stiffness[j] * error - drive.damping[j] * velocity[j]
-        torque[j] = drive.efficiency[j] * min(max(command, -limit), limit)
-        torque[j] *= 1 + drive.ripple[j] * np.sin(drive.ripple_count[j] * position[j] + drive.ripple_phase[j])
-    return torque
+    """The paper's four equations and the ripple; the loop sees the encoder."""
+    error = wanted - (position + drive.encoder_bias)
+    limit = drive.stall_torque * np.maximum(1 - np.abs(velocity) / drive.no_load_speed, 0)
+    torque = drive.efficiency * np.clip(drive.stiffness * error - drive.damping * velocity, -limit, limit)
+    torque = torque * (1 + drive.ripple * np.sin(drive.ripple_count * position + drive.ripple_phase))
+    return np.where(np.abs(error) < drive.dead_band, 0.0, torque)
 
 
 def plain_friction(drive, torque, velocity, inertia_rate):
     """What stops the joint within the sub-step, but no more than the friction; then b times the new speed."""
-    lost = np.zeros(12)
-    for j in range(12):
-        momentum = inertia_rate[j] * velocity[j] + torque[j]
-        coulomb = min(abs(momentum), drive.coulomb_friction[j]) * np.sign(momentum)
-        speed = (momentum - coulomb) / (inertia_rate[j] + drive.viscous_friction[j])
-        lost[j] = coulomb + drive.viscous_friction[j] * speed
-    return lost
+    momentum = inertia_rate * velocity + torque
+    coulomb = np.minimum(np.abs(momentum), drive.coulomb_friction) * np.sign(momentum)
+    return coulomb + drive.viscous_friction * (momentum - coulomb) / (inertia_rate + drive.viscous_friction)
 
 
 class TestEpisodes:

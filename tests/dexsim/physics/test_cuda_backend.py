@@ -92,7 +92,7 @@ def states(grasp_rollout):
 
 def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
     (expected, torque), (result, cuda_torque) = (
-        tick_of(grasp_env, physics_of(grasp_env, name))(states) for name in ("c", "cuda")
+        jax.block_until_ready(tick_of(grasp_env, physics_of(grasp_env, name))(states)) for name in ("c", "cuda")
     )
     assert emulated == [(len(states.tick), grasp_env.config.physics.substeps)]
     assert np.abs(expected.finger_force).max() > 0.5, "nothing is touched"

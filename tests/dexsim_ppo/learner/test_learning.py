@@ -72,7 +72,8 @@ class Keyed(TinyEnv):
 def test_restarts_what_ended_and_nothing_else(length, block, share=0.3):
     """Against a loop over environments and steps: who ended goes on from the start drawn for it last."""
     env, count = Keyed(), 5
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(length), count))
+    restart = jax.jit(env.restart)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(length), count))
     ends = np.random.default_rng(length).random((length, count)) < share
 
     def step(state, given):
@@ -93,8 +94,7 @@ def test_restarts_what_ended_and_nothing_else(length, block, share=0.3):
         state = jax.tree.map(lambda x, row=row: x[row], states)
         for tick in range(length):
             if tick % block == 0:
-                fresh = env.restart(state, jnp.bool_(True))
-                state = env.restart(state, jnp.bool_(False))
+                fresh, state = (restart(state, jnp.bool_(done)) for done in (True, False))
             assert float(before[tick, row]) == float(state.x)
             state = fresh if ends[tick, row] else dataclasses.replace(state, x=state.x + tick)
             if not ends[tick, row]:
@@ -117,23 +117,20 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
         return rollout, metrics, ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
 
     rollout, metrics, learnt_from = collect(state)
-    everywhere, ended, final, broken, reward = [], 0, [], 0, []
     fresh, now = (jax.vmap(env.restart)(begin, jnp.full(count, done)) for done in (True, False))
-    step = jax.jit(jax.vmap(env.step))
+    step, seen = jax.jit(jax.vmap(env.step)), []
     for action in rollout.decision.action:
         now = step(now, jnp.clip(action, -1, 1))
-        for row in range(count):
-            value = float(now.reward[row])
-            broken, reward = broken + (not np.isfinite(value)), [*reward, value if np.isfinite(value) else 0.0]
-            error = float(now.metrics["error"][row])
-            everywhere.append(error if np.isfinite(error) else 0.0)
-            if now.terminated[row] or now.truncated[row]:
-                ended, final = ended + 1, [*final, float(now.metrics["length"][row])]
-        now = jax.vmap(choose)(now.terminated | now.truncated, fresh, now)
-    assert ended > 3 and broken > 3, "the test tests less than it says"
-    assert float(metrics["episodes"]) == ended and float(metrics["nonfinite_rewards"]) == broken
-    np.testing.assert_allclose(metrics["step/error"], np.mean(everywhere), rtol=1e-4)
-    np.testing.assert_allclose(metrics["episode/length"], np.mean(final), rtol=1e-5)
-    np.testing.assert_allclose(metrics["reward"], np.mean(reward), rtol=1e-4)
-    np.testing.assert_allclose(rollout.reward.reshape(-1), reward, rtol=1e-4, atol=1e-5)
+        over = now.terminated | now.truncated
+        seen.append((now.reward, now.metrics["error"], now.metrics["length"], over))
+        now = jax.vmap(choose)(over, fresh, now)
+    reward, error, length, over = (np.array(column) for column in zip(*seen, strict=True))
+    broken = ~np.isfinite(reward)
+    reward, error = (np.where(np.isfinite(x), x, 0.0) for x in (reward, error))
+    assert over.sum() > 3 and broken.sum() > 3, "the test tests less than it says"
+    assert float(metrics["episodes"]) == over.sum() and float(metrics["nonfinite_rewards"]) == broken.sum()
+    np.testing.assert_allclose(metrics["step/error"], error.mean(), rtol=1e-4)
+    np.testing.assert_allclose(metrics["episode/length"], length[over].mean(), rtol=1e-5)
+    np.testing.assert_allclose(metrics["reward"], reward.mean(), rtol=1e-4)
+    np.testing.assert_allclose(rollout.reward, reward, rtol=1e-4, atol=1e-5)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(learnt_from))
