@@ -8,12 +8,10 @@ from pathlib import Path
 import jax
 import mujoco
 import pytest
-from mujoco import mjx
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.objects.config import SLOTS, ObjectConfig
-from dexsim.physics import mjx_backend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import check_model
 from dexsim.physics.physics import Physics, choose_backend
@@ -139,6 +137,10 @@ def used(source: str, *owners: str) -> set[str]:
 
 
 def test_the_private_names_of_mjx_exist_and_are_all_listed():
+    from mujoco import mjx  # seconds, which every process of the suite would spend
+
+    from dexsim.physics import mjx_backend
+
     source = Path(mjx_backend.__file__).read_text()
     assert used(source, "data._impl", "rows") == DATA
     assert used(source, "touch", "contact") == CONTACT
