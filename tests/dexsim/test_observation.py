@@ -94,10 +94,7 @@ PAPER = {
         "joint_position joint_torque object_position object_velocity contact_force contact_centre "
         "fingertip_position command",
     ),
-    ROTATE: (
-        65,
-        "joint_position relative_orientation last_action contact_centre contact_force fingertip_position",
-    ),
+    ROTATE: (65, "joint_position relative_orientation last_action contact_centre contact_force fingertip_position"),
 }
 
 

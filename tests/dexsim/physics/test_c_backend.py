@@ -24,12 +24,12 @@ from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
 
-WORLDS = 8
+WORLDS = 4
 AWAY = np.array([1.0, 0.0, 0.0])  # m, where nothing is near: the palm's face is a half-space
 
 
-def make(hand, gravity=GRAVITY, **changes):
-    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=gravity, backend="c")
+def make(hand, **changes):
+    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=GRAVITY, backend="c")
 
 
 def hold(index, position, velocity):
@@ -58,7 +58,7 @@ def tick(physics):
 
 @pytest.fixture(scope="module")
 def grips(hand, grasp_env):
-    """(start, model, qpos, qvel, warm start, torque) of 8 squeezed hands of each shape."""
+    """(start, model, qpos, qvel, warm start, torque) of 4 squeezed hands of each shape."""
     rng = np.random.default_rng(0)
     starts = [row(grasp_env.pool, i) for shape in SHAPES for i in rows_of(grasp_env.pool, shape)[:WORLDS]]
     return [(start, *squeeze(hand, start, rng)) for start in starts]
@@ -259,12 +259,7 @@ THICK, THIN = 0.003, 0.001
 @pytest.fixture(scope="module")
 def scenes(hand):
     """{thickness compiled in: scene} on C MuJoCo."""
-    return {
-        cover: Physics(
-            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=cover), gravity=GRAVITY, backend="c"
-        )
-        for cover in (THICK, THIN, 0.0)
-    }
+    return {cover: make(hand, pad_thickness=cover) for cover in (THICK, THIN, 0.0)}
 
 
 @pytest.fixture(scope="module")

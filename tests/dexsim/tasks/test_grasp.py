@@ -17,12 +17,7 @@ from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
-from dexsim.tasks.grasp.task import (
-    COMMANDS,
-    Grasp,
-    GraspGoal,
-    command_reward,
-)
+from dexsim.tasks.grasp.task import COMMANDS, Grasp, GraspGoal, command_reward
 from dexsim.tasks.placement import clearance
 from dexsim.touch.taxel_force import Touch
 
@@ -43,12 +38,7 @@ WEIGHTS = GraspReward(
     overload=-2.0,
 )
 CONFIG = GraspConfig(
-    finger_force=(1.0, 7.0),
-    max_force=10.0,
-    push_probability=0.02,
-    push_speed=0.3,
-    drop_distance=0.12,
-    reward=WEIGHTS,
+    finger_force=(1.0, 7.0), max_force=10.0, push_probability=0.02, push_speed=0.3, drop_distance=0.12, reward=WEIGHTS
 )
 
 

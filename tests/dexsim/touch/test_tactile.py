@@ -66,12 +66,7 @@ def test_flat_punch():
 
 
 @pytest.mark.parametrize(
-    ("cover", "depth"),
-    [
-        (0.0, [0.0006, 0, 0.0013]),
-        (-0.005, [0, 0, 0.0003]),
-        (0.001, [0.0016, 0.0009, 0.0023]),
-    ],
+    ("cover", "depth"), [(0.0, [0.0006, 0, 0.0013]), (-0.005, [0, 0, 0.0003]), (0.001, [0.0016, 0.0009, 0.0023])]
 )
 def test_rubber_of_another_thickness_feels_from_elsewhere(cover, depth):
     """The margin is the rubber's thickness beyond the lattice, which is never below zero."""
