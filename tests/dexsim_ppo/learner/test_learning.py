@@ -11,6 +11,7 @@ from tiny_env import CONFIG, SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner.loss import critic_value
 from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.policy import Policy
 
@@ -114,9 +115,11 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
     @jax.jit
     def collect(state):
         _, rollout, metrics = ppo.collect_rollout(env, config, state)
-        return rollout, metrics, ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
+        batch = ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
+        normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+        return rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
 
-    rollout, metrics, learnt_from = collect(state)
+    rollout, metrics, learnt_from, value = collect(state)
     fresh, now = (jax.vmap(env.restart)(begin, jnp.full(count, done)) for done in (True, False))
     step, seen = jax.jit(jax.vmap(env.step)), []
     for action in rollout.decision.action:
@@ -133,4 +136,5 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
     np.testing.assert_allclose(metrics["episode/length"], length[over].mean(), rtol=1e-5)
     np.testing.assert_allclose(metrics["reward"], reward.mean(), rtol=1e-4)
     np.testing.assert_allclose(rollout.reward, reward, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(rollout.value, value, rtol=1e-4, atol=1e-5)  # while there are no returns
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(learnt_from))
