@@ -24,7 +24,7 @@ from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
 
-WORLDS = 4
+WORLDS = 8
 AWAY = np.array([1.0, 0.0, 0.0])  # m, where nothing is near: the palm's face is a half-space
 
 
@@ -58,7 +58,7 @@ def tick(physics):
 
 @pytest.fixture(scope="module")
 def grips(hand, grasp_env):
-    """(start, model, qpos, qvel, warm start, torque) of 4 squeezed hands of each shape."""
+    """(start, model, qpos, qvel, warm start, torque) of 8 squeezed hands of each shape."""
     rng = np.random.default_rng(0)
     starts = [row(grasp_env.pool, i) for shape in SHAPES for i in rows_of(grasp_env.pool, shape)[:WORLDS]]
     return [(start, *squeeze(hand, start, rng)) for start in starts]

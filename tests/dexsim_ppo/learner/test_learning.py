@@ -70,7 +70,7 @@ class Keyed(TinyEnv):
 
 
 @pytest.mark.parametrize("length, block", [(7, 7), (40, 10)])
-def test_restarts_what_ended_and_nothing_else(length, block, share=0.3):
+def test_restarts_what_ended_and_nothing_else(length, block, share=0.15):
     """Against a loop over environments and steps: who ended goes on from the start drawn for it last."""
     env, count = Keyed(), 5
     restart = jax.jit(env.restart)
