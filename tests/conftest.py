@@ -11,9 +11,10 @@ import gc
 import mmap
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import jaxlib
 
@@ -113,19 +114,6 @@ def strict_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-class Rollout(NamedTuple):
-    """An environment and its compiled functions over a batch of `num_envs` environments."""
-
-    env: Any
-    reset: Callable[[jax.Array], Any]
-    """`reset(key)`: one key in, a batch of states out."""
-    step: Callable[[Any, jax.Array], Any]
-    """`step(states, actions [num_envs, A])`"""
-    restart: Callable[[Any, jax.Array], Any]
-    """`restart(states, done [num_envs])`"""
-    num_envs: int
-
-
 @pytest.fixture(scope="session")
 def hand() -> Any:
     """The XHand as shipped."""
@@ -157,8 +145,9 @@ def grasp_env() -> Any:
 
 
 @pytest.fixture(scope="session")
-def grasp_rollout(grasp_env: Any) -> Rollout:
-    """The grasp task over 8 environments, objects let go at once; each function compiles at its first use, once."""
+def grasp_rollout(grasp_env: Any) -> SimpleNamespace:
+    """The grasp task over `NUM_ENVS` environments, objects let go at once: `env`, `reset(key)`, `step(states, actions)`
+    and `restart(states, done)`; each compiles at its first use, once."""
     from episodes import ones_of
 
     restart = compilation.jit(jax.vmap(grasp_env.restart), once=True)
@@ -169,4 +158,4 @@ def grasp_rollout(grasp_env: Any) -> Rollout:
         state = restart(dataclasses.replace(before, key=jax.random.split(key, NUM_ENVS)), full > 0)
         return dataclasses.replace(state, goal=dataclasses.replace(state.goal, delay=0.0 * state.goal.delay))
 
-    return Rollout(grasp_env, reset, jax.jit(jax.vmap(grasp_env.step)), restart, NUM_ENVS)
+    return SimpleNamespace(env=grasp_env, reset=reset, step=jax.jit(jax.vmap(grasp_env.step)), restart=restart)

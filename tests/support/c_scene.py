@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from palm_touch import feel
 
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
+from dexsim.touch.taxel_force import compute_touch
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
@@ -155,22 +155,12 @@ def force_on(model: mujoco.MjModel, data: mujoco.MjData, tips, target: int) -> n
 
 def skin_law(hand, skin):
     """`law(qpos [n, J + 7], target, cover [n] m)`: the fingers' forces [n, F] N by the skin's law alone."""
-    area = jnp.asarray(hand.taxel_area)
+    bare = dataclasses.replace(skin, margin=0.0)
 
     def law(qpos, target, cover):
-        taxels = taxel_positions(hand, forward_kinematics(hand, qpos[: hand.num_joints]))
-        place = qpos[hand.num_joints :]
-        touch = feel(
-            taxels,
-            area,
-            target.shape(),
-            place[:3],
-            rotations.quat_to_matrix(place[3:]),
-            jnp.ones(hand.num_fingers),
-            dataclasses.replace(skin, margin=0.0),
-            cover,
-        )
-        return jnp.sum(touch.skin_force, -1)
+        pose, place = forward_kinematics(hand, qpos[: hand.num_joints]), qpos[hand.num_joints :]
+        turn, unit = rotations.quat_to_matrix(place[3:]), jnp.ones(hand.num_fingers)
+        return compute_touch(hand, pose, target.shape(), place[:3], turn, unit, bare, cover).skin_force.sum(-1)
 
     compiled = jax.jit(jax.vmap(law))
     return lambda qpos, target, cover=COVER: compiled(qpos, target, jnp.broadcast_to(jnp.float32(cover), len(qpos)))

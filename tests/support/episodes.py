@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.env.task import GroundTruth
-from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
-from dexsim.touch.taxel_force import Touch, compute_touch
+from dexsim.touch.taxel_force import Touch
 
 
 def with_episode(state, **parts):
@@ -74,13 +73,3 @@ def reset_to(env):
         return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal, jnp.ones(()))
 
     return reset
-
-
-def tip_stiffness(physics, skin, object, qpos):
-    """The fingertips' stiffness [F] over nominal at a pose of hand and object."""
-    hand, place = physics.hand, qpos[physics.object_qpos]
-    pose = forward_kinematics(hand, qpos[physics.joint_qpos])
-    turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-    unit = jnp.ones(hand.num_fingers)
-    pressed = compute_touch(hand, pose, object.shape(), place[:3], turn, unit, skin).skin_force.sum(-1)
-    return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

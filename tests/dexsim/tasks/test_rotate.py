@@ -418,23 +418,6 @@ class TestPool:
             file.write_bytes(file.read_bytes()[: 1000 if len(made) == 1 else None])
         assert len(made) == 2
 
-    @pytest.mark.slow
-    def test_held_by_fingers_none_is_a_drop_from_the_beginning(self, hand, monkeypatch, tmp_path):
-        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-        config = dataclasses.replace(clear_of_palm(), pool_size=12)
-        pool = Rotate(config, hand).make_pool(jax.random.key(0))
-        axis = config.turn.unit_axis
-        stand = Rotation.align_vectors([axis], [[1.0, 0, 0]])[0]  # Its face on the axis, up to a turn about it.
-        for k in range(12):
-            # The eight corners of the cube as the pool has it, in the palm frame.
-            half, slot = pool.object.size[k, 0], Rotation.from_quat(np.roll(pool.object.quat[k, 0], -1))
-            np.testing.assert_allclose(slot.apply([1.0, 0, 0]), stand.apply([1.0, 0, 0]), atol=1e-6)
-            corners = half * CORNERS
-            turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
-            low = (turn * slot).apply(corners)[:, 0].min() + pool.qpos[k, 12]
-            assert low > palm_height(hand) + 0.001 - 1e-6
-            assert np.arccos(turn.apply(axis) @ axis) < 0.35
-
     @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
     def test_a_cube_stands_on_any_axis(self, axis):
         quat = upright(TurnSpec(axis=axis).unit_axis)
