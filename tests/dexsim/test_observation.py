@@ -7,6 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from episodes import by_field
 from random_readings import random_readings
 
 from dexsim import observation
@@ -78,12 +79,8 @@ def check(hand, readings, names, config, wanted):
     vector = np.asarray(observe(hand, readings, names, config))
     fields = layout(hand, names, config)
     assert vector.dtype == np.float32 and vector.shape == (sum(f.size for f in fields),)
-    at = 0
-    for field in fields:
-        np.testing.assert_allclose(
-            vector[at : at + field.size], wanted[field.name], atol=2e-6, rtol=1e-5, err_msg=field.name
-        )
-        at += field.size
+    for name, values in by_field(fields, vector).items():
+        np.testing.assert_allclose(values, wanted[name], atol=2e-6, rtol=1e-5, err_msg=name)
     return [f.name for f in fields], len(vector)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import reset_to
+from episodes import by_field, reset_to
 
 import dexsim
 import dexsim_ppo
@@ -189,10 +189,7 @@ def test_a_right_hands_policy_fits_the_left_one(left, name):
 
 def actor_of(env, obs):
     """The actor's observation without the noise of sensors: the critic's values of its fields."""
-    values, at = {}, 0
-    for entry in env.observation_layout["critic"]:
-        values[entry.name] = obs["critic"][at : at + entry.size]
-        at += entry.size
+    values = by_field(env.observation_layout["critic"], obs["critic"])
     return jnp.concatenate([values[entry.name] for entry in env.observation_layout["actor"]])
 
 

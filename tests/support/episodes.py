@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import forward_kinematics
@@ -24,6 +25,12 @@ def ones_of(env, count, *given):
     shapes = jax.eval_shape(jax.vmap(env.reset), keys, *given)
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
     return jax.tree.map(lambda x: keys if is_key(x) else jnp.ones(x.shape, x.dtype), shapes)
+
+
+def by_field(layout, observation):
+    """Columns [..., n] of an observation by their field's name."""
+    ends = np.cumsum([entry.size for entry in layout])
+    return dict(zip((entry.name for entry in layout), jnp.split(observation, ends[:-1], axis=-1), strict=True))
 
 
 def ground_truth(env, object, physics, force):

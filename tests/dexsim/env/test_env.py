@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import skin_law
-from episodes import with_episode
+from episodes import by_field, with_episode
 
 from dexsim import observation
 from dexsim.hand.kinematics import forward_kinematics
@@ -333,11 +333,7 @@ class TestReadings:
 
     def test_the_critic_sees_the_truth(self, hand, grasp_env, history):
         after = history[-1][2]
-        critic, at = np.asarray(after.obs["critic"]), 0
-        fields = {}
-        for field in grasp_env.observation_layout["critic"]:
-            fields[field.name] = critic[:, at : at + field.size]
-            at += field.size
+        fields = by_field(grasp_env.observation_layout["critic"], after.obs["critic"])
         np.testing.assert_allclose(fields["joint_position"], after.physics.qpos[:, :12], atol=1e-6)
         np.testing.assert_allclose(fields["object_position"], after.physics.qpos[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)
