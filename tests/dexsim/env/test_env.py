@@ -1,6 +1,7 @@
 """The environment as a whole: pure steps, episodes, readings, touch. One compiled grasp for all."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import c_scene
 import jax
@@ -12,6 +13,7 @@ from c_scene import skin_law
 from episodes import by_field, with_episode
 
 from dexsim import observation
+from dexsim.env.motors import JointCommand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
 from dexsim.physics.interface import PhysicsState
@@ -149,6 +151,13 @@ class TestTick:
             close += list(np.isclose(after.finger_force[world], felt, atol=0.5, rtol=0.15)[felt > 0.5])
         assert strong >= 5, "hardly a finger touches: the test tests nothing"
         assert np.mean(close) > 0.6
+
+    def test_a_latency_of_more_than_a_tick_is_that_of_the_tick_before(self, grasp_env):
+        """Of three sub-steps: sub-steps within the tick, and the targets before and after them."""
+        one, latency = jnp.ones(3), jnp.array([0.5, 3.0, 4.5])
+        command = JointCommand(0 * one, target=3 * one, previous=2 * one, valid=one > 0, earlier=one)
+        found = grasp_env.motors._delay(SimpleNamespace(latency=latency), command)
+        np.testing.assert_allclose(found, [[0.5, 3.0, 1.5], [2, 2, 1], [3, 3, 2]])
 
     def test_torque_readings_are_the_drives(self, hand, history):
         """The torque that the motors would give at the end of the tick, over the stall torque."""

@@ -170,6 +170,8 @@ class TestReward:
             goal = dataclasses.replace(rules.begun, duty=duty, turns=jnp.int32(2))
             _, metrics = rules.rewards(goal, here)
             np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-5)
+        _, metrics = rules.rewards(rules.begun, rules.truth(object_quat=turned(90)))
+        np.testing.assert_allclose(metrics["reward/bonus"], 250)  # of the first goal nothing is asked
         assert 0 < tips < 1
 
     def test_a_gait_too_fast_earns_less(self, rules):
@@ -260,6 +262,8 @@ def test_every_term_of_a_tick(weighted):
     for name, value in known.items():
         assert float(found[name]) == pytest.approx(value, rel=2e-4, abs=1e-5), name
     assert float(reward) == pytest.approx(sum(terms.values()), rel=1e-4)
+    _, fast = weighted.rewards(weighted.begun, moment(weighted, object_spin=[-4.0, 0.0, 0.0]))
+    assert float(fast["reward/spin"]) == -3.0, "no more than 1 rad/s counts"
 
 
 def test_the_means_are_over_the_ticks_of_the_episode(weighted):
