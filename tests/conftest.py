@@ -5,14 +5,16 @@ Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests t
 """
 
 import contextlib
+import dataclasses
 import functools
 import gc
 import mmap
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import jaxlib
 
@@ -71,7 +73,7 @@ hypothesis.settings.load_profile("dexsim")
 LONGEST = """
 test_hand_tasks test_shipped_policy test_identification test_docs test_engines test_check_hand test_press_fit
 test_procedure test_import_hand test_identify_drives test_env test_shipped_policies test_gymnasium test_learning
-test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_env_options test_train
+test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_train
 test_force_hold test_c_backend test_randomization
 """.split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
@@ -94,7 +96,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 LENIENT = (
     "benchmarks",
     "dexsim/env/test_env.py",
-    "dexsim/env/test_env_options.py",
     "dexsim/objects/test_object_mesh.py",
     "dexsim/physics/test_c_backend.py",
     "dexsim/physics/test_physics.py",
@@ -113,19 +114,6 @@ def strict_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-class Rollout(NamedTuple):
-    """An environment and its compiled functions over a batch of `num_envs` environments."""
-
-    env: Any
-    reset: Callable[[jax.Array], Any]
-    """`reset(key)`: one key in, a batch of states out."""
-    step: Callable[[Any, jax.Array], Any]
-    """`step(states, actions [num_envs, A])`"""
-    restart: Callable[[Any, jax.Array], Any]
-    """`restart(states, done [num_envs])`"""
-    num_envs: int
-
-
 @pytest.fixture(scope="session")
 def hand() -> Any:
     """The XHand as shipped."""
@@ -136,35 +124,38 @@ def hand() -> Any:
 
 @pytest.fixture(scope="session")
 def grasp_env() -> Any:
-    """The grasp task on C MuJoCo: the defaults, but for a small pool (16 of each shape) of objects let go at once."""
+    """The grasp task on C MuJoCo, with imperfect taxels and a small pool (16 starts of each shape)."""
     import dexsim
+    from dexsim.sensing.config import Sensing
+    from dexsim.sensing.taxels import TaxelSensor
     from dexsim.tasks.grasp.config import GraspConfig
 
-    return dexsim.make("grasp", GraspConfig(pool_size=80, release_delay=(0.0, 0.0)), backend="c")
-
-
-@pytest.fixture(scope="session")
-def simple_env() -> Any:
-    """Grasp over physics that compile in a second, with a pool of eight objects of which some are extreme."""
-    from simple_physics import SimplePhysics
-
-    import dexsim
-    from dexsim.objects.config import ObjectConfig
-    from dexsim.tasks.grasp.config import GraspConfig
-
-    objects = ObjectConfig(shapes=("box", "sphere"), extremes=0.5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        return dexsim.make("grasp", GraspConfig(pool_size=8, objects=objects), backend="c")
-
-
-@pytest.fixture(scope="session")
-def grasp_rollout(grasp_env: Any) -> Rollout:
-    """The grasp task over 8 environments; each function compiles at its first use, once."""
-    return Rollout(
-        env=grasp_env,
-        reset=compilation.jit(lambda key: jax.vmap(grasp_env.reset)(jax.random.split(key, NUM_ENVS)), once=True),
-        step=jax.jit(jax.vmap(grasp_env.step)),
-        restart=compilation.jit(jax.vmap(grasp_env.restart), once=True),
-        num_envs=NUM_ENVS,
+    taxels = TaxelSensor(
+        resolution=0.0,
+        rate=(20.0, 30.0),
+        hysteresis=(0.0, 0.1),
+        crosstalk=(0.0, 0.05),
+        gain=(0.95, 1.05),
+        bias=(-0.01, 0.01),
+        drift=(0.0, 0.002),
+        dead=(0.0, 0.02),
     )
+    config = GraspConfig(pool_size=80, release_delay=(0.1, 0.1), sensing=Sensing(taxel=taxels))
+    return dexsim.make("grasp", config, backend="c")
+
+
+@pytest.fixture(scope="session")
+def grasp_rollout(grasp_env: Any) -> SimpleNamespace:
+    """The grasp task over `NUM_ENVS` environments, objects let go at once: `env`, `reset(key)`, `step(states, actions)`
+    and `restart(states, done)`; each compiles at its first use, once."""
+    from episodes import ones_of
+
+    restart = compilation.jit(jax.vmap(grasp_env.restart), once=True)
+    full = jax.numpy.ones(NUM_ENVS)
+    before = ones_of(grasp_env, NUM_ENVS, full)
+
+    def reset(key: jax.Array) -> Any:
+        state = restart(dataclasses.replace(before, key=jax.random.split(key, NUM_ENVS)), full > 0)
+        return dataclasses.replace(state, goal=dataclasses.replace(state.goal, delay=0.0 * state.goal.delay))
+
+    return SimpleNamespace(env=grasp_env, reset=reset, step=jax.jit(jax.vmap(grasp_env.step)), restart=restart)

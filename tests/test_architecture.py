@@ -4,8 +4,6 @@ A room is a folder of a package; a module at a package's root is a room of its o
 """
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -206,45 +204,3 @@ def test_folders_keep_their_budget(place):
     """A thing that needs more lines says what it gives up, or takes them from elsewhere."""
     folders = [f"dexsim/{path.name}" for path in (ROOT / "dexsim").glob("*.py")] if place == ROOTS else place.split()
     assert lines(*folders) <= BUDGETS[place]
-
-
-# --- what importing costs -------------------------------------------------------------------------------
-
-
-def loaded_by(code: str) -> set[str]:
-    """Modules that a fresh interpreter has loaded after this code."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    return set(done.stdout.splitlines()[-1].split())
-
-
-def inside(loaded: set[str], *packages: str) -> set[str]:
-    return {name for name in loaded if any(name == p or name.startswith(f"{p}.") for p in packages)}
-
-
-def test_policies_and_learner_load_no_simulator():
-    names = [name for name in modules() if name == "dexsim_ppo.policy" or name.startswith("dexsim_ppo.learner")]
-    loaded = loaded_by("\n".join(f"import {name}" for name in names))
-    assert set(names) <= loaded
-    assert inside(loaded, "mujoco", "mujoco.mjx", "brax", "dexsim.physics", "dexsim.env", "dexsim.tasks") == set()
-
-
-def test_running_a_policy_on_a_hand_loads_no_simulation():
-    """MuJoCo reads the hand's MJCF, and nothing else of it is used."""
-    code = """
-from dexsim import load_hand
-from dexsim_ppo import load_policy
-from dexsim_real import Controller
-import dexsim_real.run.__main__
-Controller(load_policy("grasp"), load_hand()).warm()
-"""
-    loaded = loaded_by(code)
-    assert "mujoco" in loaded and "dexsim_real.run.session" in loaded
-    forbidden = ("mujoco.mjx", "brax", "cv2", "serial", "dexsim.physics", "dexsim.env", "dexsim.tasks")
-    assert inside(loaded, *forbidden, "dexsim.render", "dexsim_ppo.training") == set()

@@ -1,4 +1,5 @@
-"""The console command `dexsim`: every command under its word, and errors that name the page that helps."""
+"""The command `dexsim`: every module's command under its word, options named in errors as they are typed, help without
+a device, Ctrl-C at any time."""
 
 import importlib
 import os
@@ -9,15 +10,19 @@ import pytest
 from paths import ROOT
 
 from dexsim import __main__ as console
+from dexsim import catalog
+from dexsim.core import cli
 from dexsim.core.errors import ConfigError
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim_ppo.evaluate import EvaluateArguments
+from dexsim_ppo.train import TrainArguments, preset_arguments
 
 
-@pytest.mark.parametrize("name", console.COMMANDS)
-def test_a_word_runs_the_module_with_the_rest_of_the_line(name, monkeypatch):
-    module = importlib.import_module(console.COMMANDS[name][0])
-    given = []
-    monkeypatch.setattr(module, "main", lambda argv: given.append(argv) or 7)
-    assert console.main([name, "--seed", "1"]) == 7 and given == [["--seed", "1"]]
+def test_a_word_runs_the_module_with_the_rest_of_the_line(monkeypatch):
+    for name, (path, _) in console.COMMANDS.items():
+        given = []
+        monkeypatch.setattr(importlib.import_module(path), "main", lambda argv, given=given: given.append(argv) or 7)
+        assert console.main([name, "--seed", "1"]) == 7 and given == [["--seed", "1"]]
 
 
 def test_every_command_of_the_modules_has_a_word():
@@ -40,10 +45,46 @@ def test_help_lists_the_commands_and_a_typo_is_named(capsys):
         console.main(["evalute"])
 
 
+def test_help_starts_no_device():
+    """With a platform that does not exist every start of JAX's devices fails."""
+    environment = os.environ | {"JAX_PLATFORMS": "none_such", "COLUMNS": "80"}
+    command = [sys.executable, "-m", "dexsim_ppo.train", "--help"]
+    child = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert child.returncode == 0 and child.stdout.startswith("usage: "), child.stderr
+
+
+TRAIN = TrainArguments[GraspConfig], preset_arguments("grasp", GraspConfig(), "cpu")
+
+
 @pytest.mark.parametrize(
-    "words",
-    ["dexsim_real.run", "dexsim train"],
+    ("options", "words", "says"),
+    [
+        (TRAIN, "--env.push-probability 3", "GraspConfig.push_probability = 3: must be between"),
+        (TRAIN, "--env.curl 0.2 -0.2", "GraspConfig.curl = (0.2, -0.2): the first must not"),
+        ((EvaluateArguments, None), "grasp --chunk -1", "EvaluateArguments.chunk = -1: "),
+    ],
 )
+def test_a_value_out_of_range_is_refused_by_the_fields_name(options, words, says):
+    cls, default = options
+    with pytest.raises(ConfigError) as error:
+        cli.parse(cls, words.split(), prog="x", description="", default=default)
+    assert str(error.value).startswith(says) and "\n" not in str(error.value)
+
+
+def test_a_misspelt_option_is_refused_and_the_right_one_named(capsys):
+    cls, default = TRAIN
+    with pytest.raises(SystemExit) as stop:
+        cli.parse(cls, ["--env.push-probabilty", "1"], prog="x", description="", default=default)
+    assert stop.value.code == 2 and "--env.push-probability" in capsys.readouterr().err
+
+
+def test_the_catalog_lists_what_there_is(capsys):
+    assert catalog.main([]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ("rotate_clear", "xhand_right (default)", "leap_like", "grasp"))
+
+
+@pytest.mark.parametrize("words", ["dexsim_real.run", "dexsim train"])
 def test_ctrl_c_while_modules_load_is_one_line(words, tmp_path):
     """Sent while a module is looked for that each command imports late."""
     (tmp_path / "sitecustomize.py").write_text("""

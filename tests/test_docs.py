@@ -17,6 +17,7 @@ from dexsim.core import cli
 from dexsim.core.config import from_dict, override
 from dexsim.geometry import grid
 from dexsim_ppo import load_policy
+from dexsim_ppo.training.presets import preset_arguments
 
 if not (ROOT / "docs").exists():
     pytest.skip("needs a checkout", allow_module_level=True)
@@ -45,11 +46,21 @@ def snippets():
                 yield pytest.param(found[2], id=f"{name_of(page)}:{line}", marks=marks)
 
 
-def commands(page: Path, start: str):
-    """A page's shell commands that begin with `start`, in blocks or inline, up to a comment; not those of a block after
-    `<!-- not run: why -->`."""
+def runnable(page: Path) -> str:
+    """A page without blocks after `<!-- not run: why -->`, each command in one line."""
     text = re.sub(r"<!-- not run: [^>]+ -->\n```\n.*?```", "", page.read_text(), flags=re.DOTALL)
-    return [found.strip() for found in re.findall(rf"{re.escape(start)}[^`\n#]*", text.replace("\\\n", " "))]
+    return text.replace("\\\n", " ")
+
+
+def commands(page: Path):
+    """Module and arguments of a page's commands: `python -m dexsim...` anywhere, `dexsim word ...` in blocks."""
+    for line in re.findall(r"python -m dexsim[^`\n#]*", runnable(page)):
+        _, _, module, *argv = shlex.split(line)
+        yield module.rstrip(".,"), argv
+    for block in re.findall(r"^```\n(.*?)^```", runnable(page), re.DOTALL | re.MULTILINE):
+        for line in re.findall(r"^dexsim [^#\n]*", block, re.MULTILINE):
+            _, word, *argv = shlex.split(line)
+            yield COMMANDS[word][0].removesuffix(".__main__"), argv
 
 
 @pytest.mark.parametrize("code", list(snippets()))
@@ -60,48 +71,30 @@ def test_snippet_runs(code, tmp_path, monkeypatch):
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
 
 
-def check_command(line):
+def check_command(module, argv):
     """Every option exists and takes the value; a shipped policy's configuration has what `--set` changes."""
-    module, *argv = shlex.split(line)[2:]
-    module = module.rstrip(".,")
+    options, default = pkgutil.resolve_name(OPTIONS[module][0]), None
     if not argv or "--help" in argv:
-        assert module in OPTIONS
-    elif module == "dexsim_ppo.train":
-        parse_train(argv)
-    else:
-        options = cli.parse(pkgutil.resolve_name(OPTIONS[module][0]), argv, prog=module, description="")
-        if getattr(options, "set", None):
-            policy = load_policy(options.policy)
-            config = from_dict(registry.find_task(policy.task).config_class, policy.env_config)
-            override(config, list(options.set))
-
-
-def parse_train(argv: list[str]) -> None:
-    from dexsim_ppo import train
-    from dexsim_ppo.training.presets import preset_arguments
-
-    task = argv[argv.index("--task") + 1] if "--task" in argv else "grasp"
-    entry = registry.find_task(task)
-    default = preset_arguments(task, entry.config(), "cpu")
-    cli.parse(train.TrainArguments[entry.config_class], argv, prog="train", description="", default=default)
-
-
-def console_lines(page: Path):
-    """Lines of code blocks that begin with the console command, as module commands."""
-    for block in re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
-        for line in re.findall(r"^dexsim [^#\n]*", block, re.MULTILINE):
-            _, name, *argv = shlex.split(line)
-            yield shlex.join(["python", "-m", COMMANDS[name][0].removesuffix(".__main__"), *argv])
+        return
+    if module == "dexsim_ppo.train":
+        task = argv[argv.index("--task") + 1] if "--task" in argv else "grasp"
+        entry = registry.find_task(task)
+        options, default = options[entry.config_class], preset_arguments(task, entry.config(), "cpu")
+    given = cli.parse(options, argv, prog=module, description="", default=default)
+    if getattr(given, "set", None):
+        policy = load_policy(given.policy)
+        config = from_dict(registry.find_task(policy.task).config_class, policy.env_config)
+        override(config, list(given.set))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_have_their_options(page):
-    for line in (*commands(page, "python -m dexsim"), *console_lines(page)):
+    for module, argv in commands(page):
         try:
-            check_command(line)
+            check_command(module, argv)
         except (Exception, SystemExit) as error:
-            raise AssertionError(f"{name_of(page)}: {line}") from error
-    for line in commands(page, "python benchmarks/"):
+            raise AssertionError(f"{name_of(page)}: {module} {shlex.join(argv)}") from error
+    for line in re.findall(r"python benchmarks/[^`\n#]*", runnable(page)):
         _, script, *argv = shlex.split(line)
         source = (ROOT / script).read_text()
         for option in (word.removeprefix("--") for word in argv if word.startswith("--")):

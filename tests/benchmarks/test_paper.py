@@ -70,24 +70,23 @@ def test_smoke(paper, here, capsys, name):
 # --- rows and seeds that are done -----------------------------------------------------------------------
 
 
-class TestResuming:
-    def test_rows_and_seeds_go_on_where_they_stopped(self, paper, here):
-        experiment, calls = stub(paper)
-        measure = experiment.measure
+def test_rows_and_seeds_go_on_where_they_stopped(paper, here):
+    experiment, calls = stub(paper)
+    measure = experiment.measure
 
-        def fails(row, seed, budget, work):
-            if (row.name, seed) == ("b", 1):
-                raise KeyboardInterrupt
-            return measure(row, seed, budget, work)
+    def fails(row, seed, budget, work):
+        if (row.name, seed) == ("b", 1):
+            raise KeyboardInterrupt
+        return measure(row, seed, budget, work)
 
-        budget = paper.data.BUDGETS["cpu"]
-        with pytest.raises(KeyboardInterrupt):
-            paper.command.run(dataclasses.replace(experiment, measure=fails), budget, here, here / "work")
-        assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 0)]
-        paper.command.run(experiment, budget, here, here / "work")
-        assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
-        report = json.loads((here / "stub" / "b" / "report.json").read_text())
-        assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
+    budget = paper.data.BUDGETS["cpu"]
+    with pytest.raises(KeyboardInterrupt):
+        paper.command.run(dataclasses.replace(experiment, measure=fails), budget, here, here / "work")
+    assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 0)]
+    paper.command.run(experiment, budget, here, here / "work")
+    assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
+    report = json.loads((here / "stub" / "b" / "report.json").read_text())
+    assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
 
 # --- what the rows are ----------------------------------------------------------------------------------
@@ -113,9 +112,6 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
             if row.ablate:
                 load_policy(row.policy).ablate(*row.ablate)
     assert len(paper.experiments.EXPERIMENTS["observations"].rows) == 7
-
-
-# --- objects that no training has seen ------------------------------------------------------------------
 
 
 # --- tables ---------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from dexsim.touch.estimate import ForceEstimate, estimate_force
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
 LOOP = ForceLoop(gain=0.5, limit=0.6)
+correct = jax.jit(correct_command, static_argnums=(0, 1, 2))
 
 
 def fingers(*force):
@@ -24,7 +25,7 @@ def test_the_correction_of_a_weak_grip_follows_its_differential_equation():
     command, slope, found, correction = 0.5, 0.8, [], jnp.zeros(())
     for _ in range(400):
         force = SPAN[0] + slope * (command + correction) * (SPAN[1] - SPAN[0])
-        correction = correct_command(LOOP, SPAN, PERIOD, jnp.asarray(command), correction, fingers(9.0, *[force] * 4))
+        correction = correct(LOOP, SPAN, PERIOD, jnp.asarray(command), correction, fingers(9.0, *[force] * 4))
         found.append(float(correction))
     final, steps = command / slope - command, np.arange(1, 401)
     np.testing.assert_allclose(found, final * (1 - (1 - LOOP.gain * slope * PERIOD) ** steps), atol=1e-5)
@@ -36,7 +37,7 @@ def test_the_correction_of_a_weak_grip_follows_its_differential_equation():
     [((0, 4, 0, 0, 0), False), ((9, 0, 0, 0, 0), False), ((9, 4, 0, 0, 0), False), ((0, 4, 0, 0, 2), True)],
 )
 def test_it_waits_for_two_fingers_beside_the_thumb(force, moves):
-    after = correct_command(LOOP, SPAN, PERIOD, jnp.asarray(1.0), jnp.asarray(0.2), fingers(*force))
+    after = correct(LOOP, SPAN, PERIOD, jnp.asarray(1.0), jnp.asarray(0.2), fingers(*force))
     assert float(after) == pytest.approx(0.2 + moves * 0.5 * (1 - (3 - 2) / 5) * PERIOD)
 
 
@@ -55,9 +56,7 @@ def test_it_rests_at_its_limit_or_at_the_ends_of_what_a_policy_is_shown(command,
     """A grip that cannot follow: the command shown is between 0 and 1.5, the correction 0.6 at most."""
     loop, correction, steps = ForceLoop(gain=20.0, limit=0.6), jnp.zeros(()), [0.0]
     for _ in range(60):
-        correction = correct_command(
-            loop, SPAN, PERIOD, jnp.asarray(command), correction, fingers(0, force, force, 0, 0)
-        )
+        correction = correct(loop, SPAN, PERIOD, jnp.asarray(command), correction, fingers(0, force, force, 0, 0))
         steps.append(float(correction))
     assert steps[-1] == pytest.approx(rest, abs=1e-6)
     if rest:

@@ -4,9 +4,9 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from swapped import drawn, rollout
 
 from dexsim.core.errors import ConfigError
 from dexsim.randomization import Randomization, sample_hand
@@ -166,16 +166,46 @@ SENSED = {
     "imu.bias": "palm_gravity",
     "imu.drift": "object_quat",
     "imu.delay": "object_quat",
+    **dict.fromkeys(
+        (f"taxels.{name}" for name in "hysteresis memory crosstalk gain bias drift alive rate".split()), "taxel_force"
+    ),
 }
 
 
+READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat", "palm_gravity")
+
+
+def leaf_name(path):
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
 def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
+    """Where every world has its neighbour's value, something differs after nine ticks."""
     states = grasp_rollout.reset(jax.random.key(21))
-    found, shows = drawn(states.episode), rollout(grasp_rollout.step, states, ticks=9)
-    # What belongs to a size, and the phase of an IMU that is as fast as the control.
-    silent = {"object.shape_index", "object.position", "object.active", "imu.phase"}
-    assert set(found) - silent == {*MOVING, *SENSED}
-    assert np.ptp(found["object.contact"], axis=0).min() > 0, "stiffness or damping of the contact is not drawn"
+    actions = np.random.default_rng(4).uniform(-0.5, 1.5, (9, *states.joint_target.shape)).astype(np.float32)
+
+    def run(episode):
+        state, rows = dataclasses.replace(states, episode=episode), []
+        for action in actions:
+            state = grasp_rollout.step(state, action)
+            rows.append([state.physics.qpos, *(getattr(state.readings, name) for name in READINGS)])
+        return [np.stack(column) for column in zip(*rows, strict=True)]
+
+    plain = run(states.episode)
+
+    def shows(path):
+        """What differs with another value there: "motion", or names of readings."""
+        swap = lambda place, leaf: jnp.roll(leaf, 1, 0) if leaf_name(place) == path else leaf  # noqa: E731
+        found = run(jax.tree_util.tree_map_with_path(swap, states.episode))
+        changed = [np.abs(a - b).max() > 1e-6 for a, b in zip(plain, found, strict=True)]
+        return [name for name, moved in zip(("motion", *READINGS), changed, strict=True) if moved]
+
+    drawn = {leaf_name(path) for path, x in jax.tree_util.tree_leaves_with_path(states.episode) if np.any(x != x[:1])}
+    # What belongs to a size, the phase of an IMU that is as fast as the control, and one of taxels, which shows late.
+    silent = {"object.shape_index", "object.position", "object.active", "imu.phase", "taxels.phase"}
+    assert drawn - silent == {*MOVING, *SENSED}
+    contact = np.asarray(states.episode.object.contact)
+    assert np.ptp(contact, axis=0).min() > 0, "stiffness or damping of the contact is not drawn"
     for path in MOVING:
         assert "motion" in shows(path), path
     for path, reading in SENSED.items():

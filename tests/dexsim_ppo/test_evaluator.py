@@ -10,7 +10,7 @@ import pytest
 from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo import evaluate
+from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, summarize
 
@@ -29,9 +29,13 @@ def policy():
     return Policy.from_training(TinyEnv(), SMALL, training_of().init(jax.random.key(0)))
 
 
-def test_whole_chunks_are_measured_and_the_seed_chooses_the_episodes(policy):
-    env = TinyEnv()
-    evaluator = evaluate.Evaluator(env, 4)
+@pytest.fixture(scope="module")
+def evaluator():
+    return Evaluator(TinyEnv(), 4)
+
+
+def test_whole_chunks_are_measured_and_the_seed_chooses_the_episodes(policy, evaluator):
+    env = evaluator.env
     reports = [evaluator(policy.params, episodes=n, seed=seed, idle=True)[0] for n, seed in ((5, 1), (8, 1), (5, 2))]
     assert [report["episodes"] for report in reports] == [8, 8, 8] and [r["seed"] for r in reports] == [1, 1, 2]
     for report, seed in zip(reports, (1, 1, 2), strict=True):  # Standing still earns 32 (1 - distance).
@@ -41,9 +45,9 @@ def test_whole_chunks_are_measured_and_the_seed_chooses_the_episodes(policy):
         assert report["seconds"] > 0
 
 
-def test_totals_are_those_of_the_series(policy):
+def test_totals_are_those_of_the_series(policy, evaluator):
     """The same episodes, their last ticks kept on the way."""
-    series, totals = (evaluate.Evaluator(env, 4)(policy.params, episodes=8, seed=3)[0] for env in (TinyEnv(), Totals()))
+    series, totals = (of(policy.params, episodes=8, seed=3)[0] for of in (evaluator, Evaluator(Totals(), 4)))
     for name in ("return", "held", "steps_held", "starts", "episodes", "steps"):
         assert totals[name] == pytest.approx(series[name], rel=1e-5), name
     assert totals["task"] == {"lived": [32] * 8}
@@ -70,14 +74,12 @@ class Commands(TinyEnv):
 def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_the_end(policy):
     """And at most a minute of each."""
     env = Commands()
-    _, film = evaluate.Evaluator(env, 8)(policy.params, episodes=8, seed=0)
+    _, film = Evaluator(env, 8)(policy.params, episodes=8, seed=0)
     starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
     shown = np.asarray(film.command).reshape(2, 6 + 5)
     np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
-    env = TinyEnv()
-    env.control_period, env.evaluation_steps = 0.5, 130
-    _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)
-    assert film["x"].shape == (2 * 120,)
+    env.control_period = 0.5
+    assert Evaluator(env, 2)._film(np.zeros((130, 2)), np.zeros((130, 2), bool)).shape == (2 * 120,)
 
 
 def test_intervals_are_by_start():

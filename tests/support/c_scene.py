@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from palm_touch import feel
 
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
+from dexsim.touch.taxel_force import compute_touch
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
@@ -135,43 +135,32 @@ def start(model: mujoco.MjModel, qpos, qvel, warmstart=None) -> mujoco.MjData:
 
 
 def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray:
-    """Force of the object on each tip link [F, 3] N, world axes: a sum over `mj_contactForce`."""
-    total = np.zeros((hand.num_fingers, 3))
-    target = model.body("object").id
-    tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
+    """Force of the object on each tip link [F, 3] N, world axes."""
+    tips = [model.body(hand.body_names[body]).id for body in hand.tip_body]
+    return force_on(model, data, tips, model.body("object").id)
+
+
+def force_on(model: mujoco.MjModel, data: mujoco.MjData, tips, target: int) -> np.ndarray:
+    """Force of the body `target` on each of the bodies `tips` [F, 3] N, world axes: a sum over `mj_contactForce`."""
+    total, tips, wrench = np.zeros((len(tips), 3)), list(tips), np.zeros(6)
     for index, contact in enumerate(data.contact):
         first, second = model.geom_bodyid[contact.geom]
-        if target not in (first, second) or contact.exclude:
-            continue
-        wrench = np.zeros(6)
-        mujoco.mj_contactForce(model, data, index, wrench)
-        force = contact.frame.reshape(3, 3).T @ wrench[:3]  # from the first geom on the second
-        for finger, tip in enumerate(tips):
-            if second == tip:
-                total[finger] += force
-            elif first == tip:
-                total[finger] -= force
+        other = second if first == target else first
+        if contact.efc_address >= 0 and target in (first, second) and other in tips:
+            mujoco.mj_contactForce(model, data, index, wrench)
+            on_second = contact.frame.reshape(3, 3).T @ wrench[:3]
+            total[tips.index(other)] += on_second if other == second else -on_second
     return total
 
 
 def skin_law(hand, skin):
     """`law(qpos [n, J + 7], target, cover [n] m)`: the fingers' forces [n, F] N by the skin's law alone."""
-    area = jnp.asarray(hand.taxel_area)
+    bare = dataclasses.replace(skin, margin=0.0)
 
     def law(qpos, target, cover):
-        taxels = taxel_positions(hand, forward_kinematics(hand, qpos[: hand.num_joints]))
-        place = qpos[hand.num_joints :]
-        touch = feel(
-            taxels,
-            area,
-            target.shape(),
-            place[:3],
-            rotations.quat_to_matrix(place[3:]),
-            jnp.ones(hand.num_fingers),
-            dataclasses.replace(skin, margin=0.0),
-            cover,
-        )
-        return jnp.sum(touch.skin_force, -1)
+        pose, place = forward_kinematics(hand, qpos[: hand.num_joints]), qpos[hand.num_joints :]
+        turn, unit = rotations.quat_to_matrix(place[3:]), jnp.ones(hand.num_fingers)
+        return compute_touch(hand, pose, target.shape(), place[:3], turn, unit, bare, cover).skin_force.sum(-1)
 
     compiled = jax.jit(jax.vmap(law))
     return lambda qpos, target, cover=COVER: compiled(qpos, target, jnp.broadcast_to(jnp.float32(cover), len(qpos)))

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.env.task import GroundTruth
-from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
-from dexsim.touch.taxel_force import Touch, compute_touch
+from dexsim.touch.taxel_force import Touch
 
 
 def with_episode(state, **parts):
@@ -25,6 +25,12 @@ def ones_of(env, count, *given):
     shapes = jax.eval_shape(jax.vmap(env.reset), keys, *given)
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
     return jax.tree.map(lambda x: keys if is_key(x) else jnp.ones(x.shape, x.dtype), shapes)
+
+
+def by_field(layout, observation):
+    """Columns [..., n] of an observation by their field's name."""
+    ends = np.cumsum([entry.size for entry in layout])
+    return dict(zip((entry.name for entry in layout), jnp.split(observation, ends[:-1], axis=-1), strict=True))
 
 
 def ground_truth(env, object, physics, force):
@@ -68,19 +74,9 @@ def still_moment(hand, position, **changes):
 
 
 def reset_to(env):
-    """`reset_to(key, index, goal=None)`: a new episode from a row of the pool."""
+    """`reset_to(key, index, goal=None)`: a new episode from a row of the pool, with ranges of full width."""
 
     def reset(key, index, goal=None):
-        return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal)
+        return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal, jnp.ones(()))
 
     return reset
-
-
-def tip_stiffness(physics, skin, object, qpos):
-    """The fingertips' stiffness [F] over nominal at a pose of hand and object."""
-    hand, place = physics.hand, qpos[physics.object_qpos]
-    pose = forward_kinematics(hand, qpos[physics.joint_qpos])
-    turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-    unit = jnp.ones(hand.num_fingers)
-    pressed = compute_touch(hand, pose, object.shape(), place[:3], turn, unit, skin).skin_force.sum(-1)
-    return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from c_scene import force_on
 
 from dexsim.physics.interface import PhysicsScene, places
 
@@ -104,7 +105,8 @@ def mujoco_substeps(scene: PhysicsScene, states: States, substeps: int) -> dict[
             )
             if substep == 0:
                 contacts = sum(contact.dist < 0 for contact in data.contact[: data.ncon])
-        rows.append((data.qpos.copy(), data.qvel.copy(), acceleration, _tip_forces(scene, model, data), contacts))
+        force = force_on(model, data, scene.tip_bodies, scene.object_body)
+        rows.append((data.qpos.copy(), data.qvel.copy(), acceleration, force, contacts))
     names = ("qpos", "qvel", "acceleration", "finger_force", "contacts")
     return {name: np.array(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
@@ -123,17 +125,3 @@ def _substep(
     data.qacc_warmstart[:] = guess
     mujoco.mj_step(model, data)
     return data.qacc.copy()
-
-
-def _tip_forces(scene: PhysicsScene, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """The object's force [F, 3] N on the fingertips, contact by contact."""
-    forces, tips = np.zeros((len(scene.tip_bodies), 3)), list(scene.tip_bodies)
-    for index, contact in enumerate(data.contact[: data.ncon]):
-        bodies = model.geom_bodyid[contact.geom].tolist()
-        finger = [body for body in bodies if body != scene.object_body]
-        if contact.efc_address >= 0 and len(finger) == 1 and finger[0] in tips:
-            local = np.zeros(6)
-            mujoco.mj_contactForce(model, data, index, local)
-            on_second = contact.frame.reshape(3, 3).T @ local[:3]
-            forces[tips.index(finger[0])] += on_second if bodies[1] == finger[0] else -on_second
-    return forces

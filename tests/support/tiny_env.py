@@ -17,10 +17,12 @@ from dexsim.core.config import Config, setting
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.adapter import Plan
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import Training, make_train
+from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
+from dexsim_ppo.learner.ppo import Training
+from dexsim_ppo.training import trainer
+from dexsim_ppo.training.presets import PRESETS
 
-# Learners: one that solves the task, and one that is quick to compile.
+# Learners: one that solves the task, and one that is quick to compile, as `tiny_train.QUICK` has it.
 CONFIG = PPOConfig(
     num_envs=64,
     rollout_length=16,
@@ -32,14 +34,7 @@ CONFIG = PPOConfig(
     iterations_per_call=10,
 )
 SMALL = dataclasses.replace(
-    CONFIG,
-    num_envs=8,
-    rollout_length=8,
-    minibatches=2,
-    epochs=2,
-    actor_layers=(8,),
-    critic_layers=(8,),
-    iterations_per_call=1,
+    PRESETS["cpu"].ppo, num_envs=16, rollout_length=8, minibatches=2, epochs=2, actor_layers=(8,), critic_layers=(8,)
 )
 
 
@@ -139,7 +134,11 @@ class TinyEnv:
         return {"x": state.x}
 
 
-@functools.cache
+# Runs and tests with the same settings share their environment and its compiled programs.
+make_env = functools.cache(lambda env_class, config: env_class(config))
+make_train, make_evaluator = functools.cache(trainer.make_train), functools.cache(trainer.Evaluator)
+
+
 def training_of(config: PPOConfig = SMALL, env_class: type[TinyEnv] = TinyEnv) -> Training:
     """The learner on the environment, compiled once for all tests of a process."""
-    return make_train(env_class(), config)
+    return make_train(make_env(env_class, TinyConfig()), config, CurriculumConfig(), None)

@@ -4,27 +4,25 @@ import functools
 import types
 
 import pytest
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import TinyConfig, TinyEnv, make_env, make_evaluator, make_train
 
 import dexsim
 from dexsim import registry
+from dexsim_ppo import evaluate
 from dexsim_ppo.training import trainer
 
 ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, task=TinyEnv, environment=None)
 
+# With the learner `tiny_env.SMALL`.
 QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16".split()
+QUICK += "--ppo.critic-layers 8 --ppo.minibatches 2 --ppo.epochs 2".split()
+QUICK += "--evaluation-chunk 16 --evaluation-episodes 16".split()
 PER_ITERATION = 16 * 8  # steps of QUICK
 
 
-# Runs with the same settings share their environment and its compiled programs.
-make_env = functools.cache(lambda env_class, config, backend: env_class(config, backend=backend))
-make_train, make_evaluator = functools.cache(trainer.make_train), functools.cache(trainer.Evaluator)
-
-
-def make(env_class, task, config=None, *, backend="auto", **_):
+def make(env_class, task, config=None, **_):
     assert task == "tiny"
-    return make_env(env_class, config or TinyConfig(), backend)
+    return make_env(env_class, config or TinyConfig())
 
 
 def install(patch, env_class=TinyEnv):
@@ -32,7 +30,8 @@ def install(patch, env_class=TinyEnv):
     tiny = functools.partial(make, env_class)
     patch.setitem(registry.TASKS, "tiny", ENTRY)
     patch.setattr(trainer, "make_train", make_train)
-    patch.setattr(trainer, "Evaluator", make_evaluator)
+    for module in (trainer, evaluate):
+        patch.setattr(module, "Evaluator", make_evaluator)
     patch.setattr(registry, "make", tiny)
     patch.setattr(dexsim, "make", tiny, raising=False)
 

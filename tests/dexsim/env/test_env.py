@@ -1,6 +1,7 @@
 """The environment as a whole: pure steps, episodes, readings, touch. One compiled grasp for all."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import c_scene
 import jax
@@ -9,9 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import skin_law
-from episodes import with_episode
+from episodes import by_field, with_episode
 
 from dexsim import observation
+from dexsim.env.motors import JointCommand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
 from dexsim.physics.interface import PhysicsState
@@ -150,17 +152,20 @@ class TestTick:
         assert strong >= 5, "hardly a finger touches: the test tests nothing"
         assert np.mean(close) > 0.6
 
+    def test_a_latency_of_more_than_a_tick_is_that_of_the_tick_before(self, grasp_env):
+        """Of three sub-steps: sub-steps within the tick, and the targets before and after them."""
+        one, latency = jnp.ones(3), jnp.array([0.5, 3.0, 4.5])
+        command = JointCommand(0 * one, target=3 * one, previous=2 * one, valid=one > 0, earlier=one)
+        found = grasp_env.motors._delay(SimpleNamespace(latency=latency), command)
+        np.testing.assert_allclose(found, [[0.5, 3.0, 1.5], [2, 2, 1], [3, 3, 2]])
+
     def test_torque_readings_are_the_drives(self, hand, history):
         """The torque that the motors would give at the end of the tick, over the stall torque."""
         _, _, after = history[5]
-        for world in range(WORLDS):
-            torque = plain_drive(
-                c_scene.row(after.episode.hand.actuator, world),
-                np.asarray(after.joint_target[world]),
-                np.asarray(after.physics.qpos[world, :12]),
-                np.asarray(after.physics.qvel[world, :12]),
-            )
-            np.testing.assert_allclose(after.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
+        drive = c_scene.row(after.episode.hand.actuator, slice(None))
+        position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
+        torque = plain_drive(drive, np.asarray(after.joint_target), position, velocity)
+        np.testing.assert_allclose(after.joint_torque * hand.torque_limit, torque, atol=2e-5)
 
     def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
@@ -175,28 +180,19 @@ class TestTick:
 
 
 def plain_drive(drive, wanted, position, velocity):
-    """The paper's four equations and the ripple, joint by joint; the loop sees the encoder."""
-    torque = np.zeros(12)
-    for j in range(12):
-        error = wanted[j] - (position[j] + drive.encoder_bias[j])
-        if abs(error) < drive.dead_band[j]:
-            continue
-        limit = drive.stall_torque[j] * max(1 - abs(velocity[j]) / drive.no_load_speed[j], 0)
-        command = drive.stiffness[j] * error - drive.damping[j] * velocity[j]
-        torque[j] = drive.efficiency[j] * min(max(command, -limit), limit)
-        torque[j] *= 1 + drive.ripple[j] * np.sin(drive.ripple_count[j] * position[j] + drive.ripple_phase[j])
-    return torque
+    """The paper's four equations and the ripple; the loop sees the encoder."""
+    error = wanted - (position + drive.encoder_bias)
+    limit = drive.stall_torque * np.maximum(1 - np.abs(velocity) / drive.no_load_speed, 0)
+    torque = drive.efficiency * np.clip(drive.stiffness * error - drive.damping * velocity, -limit, limit)
+    torque = torque * (1 + drive.ripple * np.sin(drive.ripple_count * position + drive.ripple_phase))
+    return np.where(np.abs(error) < drive.dead_band, 0.0, torque)
 
 
 def plain_friction(drive, torque, velocity, inertia_rate):
     """What stops the joint within the sub-step, but no more than the friction; then b times the new speed."""
-    lost = np.zeros(12)
-    for j in range(12):
-        momentum = inertia_rate[j] * velocity[j] + torque[j]
-        coulomb = min(abs(momentum), drive.coulomb_friction[j]) * np.sign(momentum)
-        speed = (momentum - coulomb) / (inertia_rate[j] + drive.viscous_friction[j])
-        lost[j] = coulomb + drive.viscous_friction[j] * speed
-    return lost
+    momentum = inertia_rate * velocity + torque
+    coulomb = np.minimum(np.abs(momentum), drive.coulomb_friction) * np.sign(momentum)
+    return coulomb + drive.viscous_friction * (momentum - coulomb) / (inertia_rate + drive.viscous_friction)
 
 
 class TestEpisodes:
@@ -228,7 +224,8 @@ class TestEpisodes:
 
     def test_a_random_clock_is_uniform(self, grasp_env, history):
         state, limit = history[0][0], grasp_env.task.episode_ticks
-        draw = jax.vmap(lambda key: grasp_env.randomize_episode_time(row(state, 0), key).tick)
+        first = row(state, 0)
+        draw = jax.jit(jax.vmap(lambda key: grasp_env.randomize_episode_time(first, key).tick))
         assert np.histogram(draw(jax.random.split(jax.random.key(6), 4000)), 4, (0, limit))[0].min() > 850
 
     def test_restart_touches_only_what_is_done(self, grasp_env, grasp_rollout, history):
@@ -251,6 +248,53 @@ class TestEpisodes:
         # The object goes with its start.
         at = np.flatnonzero((np.asarray(grasp_env.pool.qpos) == ours[".physics.qpos"][0]).all(1))[0]
         np.testing.assert_array_equal(begun.episode.object.size[0], grasp_env.pool.object.size[at])
+
+    def test_restarts_draw_at_the_states_scale_of_which_zero_is_nominal(self, hand, grasp_env, grasp_rollout, history):
+        """Only what is done is drawn; sizes stay as the pool has them."""
+        state, done = history[-1][2], np.arange(WORLDS) < 6
+        begun = grasp_rollout.restart(dataclasses.replace(state, scale=jnp.zeros(WORLDS)), jnp.asarray(done))
+        np.testing.assert_array_equal(begun.scale, 0.0)
+        assert_same(begun.episode, state.episode, ~done)
+        episode, objects = row(begun.episode, done), grasp_env.config.objects
+        for value, nominal in (
+            (episode.hand.actuator.stall_torque, hand.torque_limit),
+            (episode.hand.encoder_bias, 0),
+            (episode.hand.tilt, 0),
+            (episode.imu.bias, 0),
+            (episode.taxels["gain"], 1),
+            (episode.taxels["bias"], 0),
+            (episode.taxels["crosstalk"], 0),
+            (episode.taxels["alive"], True),
+            (episode.object.mass, np.mean(objects.mass)),
+            (episode.object.friction, np.mean(objects.friction)),
+            (episode.object.com, 0),
+            (episode.object.contact[:, 0], np.mean(objects.stiffness)),
+        ):
+            np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
+        assert len(np.unique(episode.object.contact[:, 1])) == 1
+        box = np.flatnonzero(np.asarray(episode.object.shape_index) == SHAPES.index("box"))
+        square = np.asarray(episode.object.size)[box, 0] ** 2
+        inertia = np.mean(objects.mass) / 3 * (square.sum(-1, keepdims=True) - square)
+        assert len(box) and np.ptp(inertia) > 0
+        np.testing.assert_allclose(episode.object.inertia[box], inertia, rtol=1e-4)
+
+    def test_an_object_is_held_until_it_is_let_go(self, grasp_env, grasp_rollout):
+        """For 0.1 s, four ticks; then it falls freely."""
+        state = grasp_rollout.reset(jax.random.key(3))
+        aside = state.physics.qpos.at[:, 13].add(1.0)
+        state = dataclasses.replace(
+            state,
+            physics=dataclasses.replace(state.physics, qpos=aside),
+            goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1)),
+        )
+        heights, still = [], state.key
+        for _ in range(7):  # the same chance in every tick: one without a push
+            state = grasp_rollout.step(dataclasses.replace(state, key=still), jnp.zeros((WORLDS, 12)))
+            heights.append(np.asarray(state.physics.qpos[:, 12]))
+        np.testing.assert_array_equal(heights[:4], [heights[0]] * 4)
+        steps = grasp_env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
+        fall = 0.5 * 9.81 * steps * (steps + 1) * grasp_env.config.physics.timestep**2
+        np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], WORLDS), rtol=0.02)
 
 
 class TestTrouble:
@@ -298,11 +342,7 @@ class TestReadings:
 
     def test_the_critic_sees_the_truth(self, hand, grasp_env, history):
         after = history[-1][2]
-        critic, at = np.asarray(after.obs["critic"]), 0
-        fields = {}
-        for field in grasp_env.observation_layout["critic"]:
-            fields[field.name] = critic[:, at : at + field.size]
-            at += field.size
+        fields = by_field(grasp_env.observation_layout["critic"], after.obs["critic"])
         np.testing.assert_allclose(fields["joint_position"], after.physics.qpos[:, :12], atol=1e-6)
         np.testing.assert_allclose(fields["object_position"], after.physics.qpos[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)

@@ -28,8 +28,8 @@ WORLDS = 8
 AWAY = np.array([1.0, 0.0, 0.0])  # m, where nothing is near: the palm's face is a half-space
 
 
-def make(hand, gravity=GRAVITY, **changes):
-    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=gravity, backend="c")
+def make(hand, **changes):
+    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=GRAVITY, backend="c")
 
 
 def hold(index, position, velocity):
@@ -259,12 +259,7 @@ THICK, THIN = 0.003, 0.001
 @pytest.fixture(scope="module")
 def scenes(hand):
     """{thickness compiled in: scene} on C MuJoCo."""
-    return {
-        cover: Physics(
-            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=cover), gravity=GRAVITY, backend="c"
-        )
-        for cover in (THICK, THIN, 0.0)
-    }
+    return {cover: make(hand, pad_thickness=cover) for cover in (THICK, THIN, 0.0)}
 
 
 @pytest.fixture(scope="module")

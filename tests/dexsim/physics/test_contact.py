@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from episodes import tip_stiffness
+from episodes import ground_truth
 
 from dexsim.objects.config import SHAPES
 from dexsim.objects.params import damping_ratio
 from dexsim.physics import contact
+from dexsim.physics.interface import PhysicsState
 from dexsim.touch.skin import Skin
 
 BALL = """
@@ -67,7 +68,8 @@ def test_springs_follow_the_skin(hand, grasp_env):
 
     @jax.jit
     def configure(target, qpos):
-        model = physics.configure(target, tip_stiffness(physics, Skin(), target, qpos))
+        state = PhysicsState(qpos, jnp.zeros(18), jnp.zeros(18))
+        model = physics.configure(target, ground_truth(grasp_env, target, state, jnp.zeros((5, 3))).tip_stiffness)
         return model["pair_solref"], model["pair_solimp"]
 
     first, second = (

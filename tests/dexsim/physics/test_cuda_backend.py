@@ -1,7 +1,10 @@
-"""The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU."""
+"""The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU; the arguments as C++
+has them; each task's kernel through NVRTC, which needs no GPU."""
 
+import ctypes
 import dataclasses
 import math
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +12,14 @@ import numpy as np
 import pytest
 import warp_emulation
 
+import dexsim
 from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi
 from dexsim.physics import physics as engines
-from dexsim.physics.cuda import backend, launch
+from dexsim.physics.cuda import backend, launch, program
+from dexsim.physics.cuda.scene import Buffer, args_type, declare_args
 from dexsim.physics.physics import Physics
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -61,7 +67,7 @@ def physics_of(env, name):
     return Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=name)
 
 
-def tick(env, physics, state):
+def tick_of(env, physics):
     """A control tick of a batch under the task's own motors, whose targets have moved a little."""
     motors = Motors(physics)
 
@@ -72,7 +78,7 @@ def tick(env, physics, state):
         result = physics.advance(law, s.episode.object, s.physics, push, s.tip_stiffness)
         return result, motors.current_torque(s.episode.hand, command, result.state)[0]
 
-    return jax.block_until_ready(jit(jax.vmap(one), once=True)(state))
+    return jit(jax.vmap(one), once=True)
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +86,61 @@ def states(grasp_rollout):
     """Start states, a few ticks on: objects lie on the hand."""
     state = grasp_rollout.reset(jax.random.key(0))
     for _ in range(6):
-        state = grasp_rollout.step(state, jnp.full((grasp_rollout.num_envs, grasp_rollout.env.action_size), 0.5))
+        state = grasp_rollout.step(state, jnp.full(state.joint_target.shape, 0.5))
     return state
 
 
 def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
-    expected, torque = tick(grasp_env, physics_of(grasp_env, "c"), states)
-    result, cuda_torque = tick(grasp_env, physics_of(grasp_env, "cuda"), states)
+    (expected, torque), (result, cuda_torque) = (
+        jax.block_until_ready(tick_of(grasp_env, physics_of(grasp_env, name))(states)) for name in ("c", "cuda")
+    )
     assert emulated == [(len(states.tick), grasp_env.config.physics.substeps)]
     assert np.abs(expected.finger_force).max() > 0.5, "nothing is touched"
     np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=2e-5)
     np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)
     np.testing.assert_allclose(cuda_torque, torque, atol=1e-3)
+
+
+BUFFERS = [
+    Buffer("qpos", 4),
+    Buffer("law_0", 2, ctype="int"),
+    Buffer("law_1", 1, ctype="bool"),
+    Buffer("qpos_out", 4, output=True),
+]
+
+
+def test_the_struct_is_that_of_cpp(tmp_path):
+    names = [buffer.name for buffer in BUFFERS] + [name for name, *_ in args_type(1)._fields_[1:]]
+    offsets = ", ".join(f"offsetof(Args, {name})" for name in names)
+    source = tmp_path / "args.cpp"
+    source.write_text(
+        f"#include <cstddef>\n#include <cstdio>\n{declare_args(BUFFERS)}\n"
+        f'int main() {{ const size_t all[] = {{sizeof(Args), {offsets}}}; for (size_t x : all) printf("%zu ", x); }}'
+    )
+    subprocess.run(["g++", source, "-o", tmp_path / "args"], check=True)
+    size, *there = map(int, subprocess.check_output(tmp_path / "args").split())
+    args = args_type(len(BUFFERS))
+    pointers = [8 * index for index in range(len(BUFFERS))]
+    assert there == pointers + [getattr(args, name).offset for name, *_ in args._fields_[1:]]
+    assert size == ctypes.sizeof(args)
+
+
+@pytest.mark.parametrize("task", ["rotate", "grasp"])
+def test_tasks_compile(task, emulated, monkeypatch):
+    try:
+        compiler = program.find_compiler()
+    except ConfigError as error:
+        pytest.skip(str(error))
+    texts = []
+    monkeypatch.setattr(backend, "source", program.source)
+    monkeypatch.setattr(backend, "compile_kernel", lambda text, _: texts.append(text))
+    monkeypatch.setattr(launch, "load", lambda *_: "0")
+    env = dexsim.make(task, backend="c")
+    states = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 1))
+    for _ in range(2):
+        jax.eval_shape(tick_of(env, physics_of(env, "cuda")), states)
+    assert texts[0] == texts[1], "kernels are cached by their text"
+    code = compiler.compile(texts[0], program.headers(), (*program.OPTIONS, "--gpu-architecture=sm_90"))
+    assert code[:4] == b"\x7fELF"
+    for name in (program.ENTRY, program.SHARED_BYTES):
+        assert name.encode() in code

@@ -5,7 +5,6 @@
 """
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -97,15 +96,9 @@ def outcome_on(hand, backend):
 
 @pytest.fixture(scope="module")
 def linearized(hand):
-    """Outcome and gradient of `WEIGHT` times it: one compilation."""
+    """Outcome [15] and its change along a direction [4]: one compilation."""
     outcome = outcome_on(hand, "mjx")
-
-    @functools.partial(jit, once=True)
-    def run(x):
-        value, pull = jax.vjp(outcome, x)
-        return value, pull(WEIGHT)[0]
-
-    return run
+    return jit(lambda x, way: jax.jvp(outcome, (x,), (way,)), once=True)
 
 
 @pytest.fixture(scope="module", params=[0.9, 0.1], ids=["grip", "slip"])
@@ -115,20 +108,27 @@ def moment(request):
 
 
 def test_a_grip_and_a_slip_are_c_mujocos(hand, linearized, moment):
-    expected, found = jax.jit(outcome_on(hand, "c"))(moment), linearized(moment)[0]
+    expected, (found, _) = jax.jit(outcome_on(hand, "c"))(moment), linearized(moment, 0 * moment)
     assert np.abs(expected[9:]).max() > 0.5, "the object is not touched"
     np.testing.assert_allclose(found[:9], expected[:9], atol=5e-3)
     np.testing.assert_allclose(found[9:], expected[9:], atol=0.02)
 
 
 def test_gradients_in_a_pinch_are_finite_differences(linearized, moment):
-    steps = np.diag(np.float32([0.01, 0.01, 0.02, 0.002]))
-    _, reverse = linearized(moment)
-    numeric = [
-        WEIGHT @ (linearized(moment + step)[0] - linearized(moment - step)[0]) / (2 * step.sum()) for step in steps
-    ]
-    np.testing.assert_allclose(reverse, numeric, rtol=0.01, atol=1e-3)
-    assert (abs(reverse[2]) > 1e-6) == (moment[2] < 0.5), "contacts that stick do not feel friction, those that slip do"
+    for way in np.diag(np.float32([0.01, 0.01, 0.02, 0.002])):
+        (ahead, _), (behind, _) = linearized(moment + way, way), linearized(moment - way, way)
+        slope = WEIGHT @ linearized(moment, way)[1]
+        np.testing.assert_allclose(slope, WEIGHT @ (ahead - behind) / 2, rtol=0.01, atol=1e-3 * way.max())
+    _, slope = linearized(moment, np.float32([0, 0, 1, 0]))
+    assert (abs(WEIGHT @ slope) > 1e-6) == (moment[2] < 0.5), "contacts feel friction where they slip"
+
+
+@pytest.mark.slow
+def test_reverse_mode_agrees_with_forward_mode(hand, linearized, moment):
+    outcome = outcome_on(hand, "mjx")
+    reverse = jit(lambda x: jax.vjp(outcome, x)[1](WEIGHT)[0], once=True)(moment)
+    forward = [WEIGHT @ linearized(moment, way)[1] for way in np.eye(4, dtype=np.float32)]
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5)
 
 
 def test_what_mjx_refuses_is_named(hand, monkeypatch):

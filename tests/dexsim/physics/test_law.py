@@ -87,6 +87,11 @@ def every_operation(reach):
     return law
 
 
+@jax.jit
+def reference(index, reach, position, velocity):
+    return jax.vmap(lambda r, p, v: every_operation(r)(index, p, v))(reach, position, velocity)
+
+
 @WAYS
 def test_every_operation(tmp_path, way):
     reach, recorded = np.float32(np.random.default_rng(1).normal(size=WORLDS)), []
@@ -99,7 +104,7 @@ def test_every_operation(tmp_path, way):
     law = way(recorded[-1], values, tmp_path)
     position, velocity = moments(2)
     for index in (1, 2):
-        expected = jax.vmap(lambda r, p, v, i=index: every_operation(r)(jnp.int32(i), p, v))(reach, position, velocity)
+        expected = reference(jnp.int32(index), reach, position, velocity)
         for result, value in zip(law(index, position, velocity), expected, strict=True):
             np.testing.assert_allclose(result, value, rtol=1e-5, atol=2e-6)
 

@@ -1,15 +1,19 @@
-"""Choosing an engine, and building its scene."""
+"""Choosing an engine and building its scene; a guard that names what the physics would drop; private names of MJX."""
 
+import ast
 import shutil
 import types
+from pathlib import Path
 
 import jax
+import mujoco
 import pytest
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.model import check_model
 from dexsim.physics.physics import Physics, choose_backend
 
 GRAVITY = (9.81, 0.0, 0.0)
@@ -57,3 +61,93 @@ def test_a_model_without_named_contact_geoms(hand, tmp_path):
     path.write_text(path.read_text().replace('name="ring_link1" class', "class"))
     with pytest.raises(AssetError, match=f"{path}.*needs a name"):
         make(load_hand(tmp_path / "xhand_right.toml"))
+
+
+def scene(*, actuator="", sensor="", joint="", option="", extra="", world=""):
+    """A link with a joint, and a free block."""
+    return mujoco.MjModel.from_xml_string(f"""
+    <mujoco>
+      <option {option}/>{extra}
+      <worldbody>{world}
+        <body name="link">
+          <joint name="knuckle" axis="0 1 0" {joint}/><geom name="tip" mass=".1" size=".01"/>
+        </body>
+        <body name="thing" pos="0 0 1"><freejoint/><geom name="block" type="box" size=".01 .01 .01"/></body>
+      </worldbody>
+      <actuator>{actuator}</actuator>
+      <sensor>{sensor}</sensor>
+    </mujoco>""")
+
+
+def motor(attributes):
+    return f'<motor name="tendon" joint="knuckle" {attributes}/>'
+
+
+DC_MOTOR = '<dcmotor name="tendon" joint="knuckle" motorconst=".1" resistance="1"/>'
+MESH = '<asset><mesh name="wedge" vertex="0 0 0  .01 0 0  0 .01 0  0 0 .01"/></asset>'
+CLOTH = (
+    '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".01 .01 .01" mass=".1" dim="2" radius=".001">'
+    '<edge equality="true"/></flexcomp>'
+)
+IGNORED = [
+    ({"actuator": motor('delay=".03" nsample="20"')}, "actuator delay"),
+    ({"actuator": motor('nsample="20"')}, "actuator delay"),
+    ({"actuator": motor('armature=".01"')}, "actuator armature"),
+    ({"actuator": motor('damping=".01"')}, "actuator damping"),
+    ({"actuator": motor('damping="0 .01"')}, "actuator damping"),
+    ({"actuator": DC_MOTOR}, "dcmotor or pid actuators"),
+    ({"actuator": '<pid name="tendon" joint="knuckle" kp="1" ki="1"/>'}, "dcmotor or pid actuators"),
+    ({"sensor": '<jointpos name="angle" joint="knuckle" interval=".03"/>'}, "sensor delay or interval"),
+    ({"extra": MESH, "sensor": '<tactile name="skin" geom="tip" mesh="wedge"/>'}, "tactile sensors"),
+    ({"joint": 'damping=".1 .2"'}, "polynomial joint damping"),
+    ({"joint": 'stiffness=".1 .2"'}, "polynomial joint stiffness"),
+    ({"world": CLOTH}, "flex bodies"),
+    ({"option": 'density="1.2"'}, "fluid forces"),
+    ({"option": 'viscosity="1e-5"'}, "fluid forces"),
+    ({"option": 'wind="1 0 0"'}, "fluid forces"),
+    ({"option": 'noslip_iterations="3"'}, "noslip iterations"),
+    ({"extra": '<option><flag limit="disable" contact="disable"/></option>'}, "flags that disable limit, contact"),
+    ({"extra": '<option o_solref="0.1 1"><flag override="enable"/></option>'}, "flag override"),
+]
+
+
+@pytest.mark.parametrize(("parts", "feature"), IGNORED)
+def test_ignored_features_are_refused(parts, feature):
+    with pytest.raises(AssetError) as error:
+        check_model(scene(**parts), "some/hand.xml")
+    text = str(error.value)
+    assert text.startswith("some/hand.xml: cannot simulate: ") and feature in text
+    assert ";" not in text  # this feature and no other
+
+
+def test_what_the_engines_simulate_passes(hand):
+    joint = 'damping=".1" stiffness=".1" armature=".01" frictionloss=".01"'
+    check_model(scene(actuator=motor('gear="2"'), sensor='<jointpos joint="knuckle"/>', joint=joint))
+    check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)))
+
+
+DATA = {"contact", "efc_D", "efc_J", "efc_aref", "efc_force", "efc_frictionloss", "ne", "nf"}
+CONTACT = {"dim", "dist", "efc_address", "frame", "friction", "geom", "includemargin"}
+
+
+def used(source: str, *owners: str) -> set[str]:
+    """Attributes taken from expressions or variables with these texts."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute)]
+    return {node.attr for node in nodes if ast.unparse(node.value) in owners}
+
+
+def test_the_private_names_of_mjx_exist_and_are_all_listed():
+    from mujoco import mjx  # seconds, which every process of the suite would spend
+
+    from dexsim.physics import mjx_backend
+
+    source = Path(mjx_backend.__file__).read_text()
+    assert used(source, "data._impl", "rows") == DATA
+    assert used(source, "touch", "contact") == CONTACT
+    sphere = '<body><freejoint/><geom size=".1"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{sphere}</worldbody></mujoco>'
+    )
+    private = mjx.make_data(mjx.put_model(model))._impl
+    assert [name for name in DATA if not hasattr(private, name)] == []
+    assert [name for name in CONTACT if not hasattr(private.contact, name)] == []

@@ -126,7 +126,7 @@ def test_dead_taxels_stay_dead_and_their_share_is_drawn():
     dead = readings == 0
     np.testing.assert_array_equal(dead[0], dead[2])
     np.testing.assert_array_equal(dead[0], ~np.asarray(params["alive"]))
-    shares = jax.vmap(lambda key: 1 - jnp.mean(sensor.sample(key)["alive"]))(jax.random.split(KEY, 100))
+    shares = jax.jit(jax.vmap(lambda key: 1 - jnp.mean(sensor.sample(key)["alive"])))(jax.random.split(KEY, 100))
     assert float(shares.mean()) == pytest.approx(0.1, abs=0.01)
 
 
@@ -141,5 +141,5 @@ def test_sampling_below_the_control_rate_holds_the_last_reading():
     age = ramp - readings[:, 0, 0]
     assert age.max() <= 2
     np.testing.assert_array_equal(readings, np.broadcast_to(readings[:, :1, :1], readings.shape))
-    phases = jax.vmap(lambda key: sensor.sample(key)["phase"])(jax.random.split(KEY, 200))
+    phases = jax.jit(jax.vmap(lambda key: sensor.sample(key)["phase"]))(jax.random.split(KEY, 200))
     assert 0.2 < float(phases.std()) < 0.35

@@ -1,5 +1,6 @@
-"""The grasp task's rules against hand-computed values; its start states against C MuJoCo."""
+"""The grasp task's rules against hand-computed values; its start states against C MuJoCo; clearances of other hands."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -11,15 +12,13 @@ import numpy as np
 import pytest
 from episodes import still_moment
 
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import AssetError, ConfigError
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig
+from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
-from dexsim.tasks.grasp.task import (
-    COMMANDS,
-    Grasp,
-    GraspGoal,
-    command_reward,
-)
+from dexsim.tasks.grasp.task import COMMANDS, Grasp, GraspGoal, command_reward
+from dexsim.tasks.placement import clearance
 from dexsim.touch.taxel_force import Touch
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
@@ -39,12 +38,7 @@ WEIGHTS = GraspReward(
     overload=-2.0,
 )
 CONFIG = GraspConfig(
-    finger_force=(1.0, 7.0),
-    max_force=10.0,
-    push_probability=0.02,
-    push_speed=0.3,
-    drop_distance=0.12,
-    reward=WEIGHTS,
+    finger_force=(1.0, 7.0), max_force=10.0, push_probability=0.02, push_speed=0.3, drop_distance=0.12, reward=WEIGHTS
 )
 
 
@@ -229,3 +223,40 @@ class TestPool:
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))
         with pytest.raises(ConfigError, match="0 of 5 start states of shape 'box'"):
             Grasp(GraspConfig(pool_size=5, objects=wide), hand).make_pool(jax.random.key(0))
+
+
+def with_geoms(hand, change):
+    return dataclasses.replace(hand, geoms=tuple(geom for old in hand.geoms if (geom := change(old)) is not None))
+
+
+def gap(hand, joints, shape, place):
+    """`clearance` of an object that is not turned."""
+    return float(jax.jit(lambda place: clearance(hand, joints, shape, place, jnp.eye(3)))(place))
+
+
+def test_spheres_count_and_a_hand_of_a_palm_alone_is_refused(hand):
+    balls = with_geoms(hand, lambda g: dataclasses.replace(g, kind="sphere") if g.kind == "capsule" else g)
+    shape = jax.jit(lambda key: sample_object(key, ObjectConfig()))(jax.random.key(0)).shape()
+    joints, away = jnp.zeros(hand.num_joints), jnp.array([1.0, 0.0, 0.1])
+    middle = max(float(np.linalg.norm(np.asarray(geom.position))) for geom in hand.geoms)
+    assert 0.5 - middle < gap(balls, joints, shape, away) < 1.0
+    with pytest.raises(AssetError, match="no capsule, sphere or box has contype"):
+        gap(with_geoms(hand, lambda g: g if g.kind == "box" else None), joints, shape, away)
+
+
+def test_boxes_of_links_count(hand):
+    """An object in a link's box is not clear of it."""
+    link, joints = hand.body_names.index("right_hand_mid_link1"), jnp.zeros(hand.num_joints)
+    pose = jax.jit(forward_kinematics, static_argnums=0)(hand, joints)
+    place = pose.body_position[link] + jnp.array([0.0, 0.0, 0.02])
+    shape = jax.jit(lambda key: sample_object(key, ObjectConfig()))(jax.random.key(0)).shape()
+
+    def boxed(geom):
+        if geom.kind != "capsule":
+            return geom
+        size = np.array([0.01, 0.01, 0.03], np.float32)
+        return dataclasses.replace(geom, kind="box", size=size) if geom.body == link else None
+
+    boxes = with_geoms(hand, boxed)
+    assert gap(boxes, joints, shape, place) < -0.005
+    assert gap(boxes, joints, shape, place + jnp.array([0.2, 0.0, 0.0])) > 0.1

@@ -1,21 +1,31 @@
 """Touch against closed forms: Mooney-Rivlin, flat punch, Winkler's sphere; reduction; gradients."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from palm_touch import feel
 from shapes import solid
 
-from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.hand.kinematics import HandPose, forward_kinematics, taxel_positions
 from dexsim.touch import reduce as touch_reduce
 from dexsim.touch import skin as touch_skin
 from dexsim.touch.skin import Skin
-from dexsim.touch.taxel_force import project_on_normals
+from dexsim.touch.taxel_force import compute_touch, project_on_normals
 
 EYE = np.eye(3, dtype=np.float32)
 reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
 skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
+
+
+def feel(taxels, area, geometry, position, rotation, finger_force, skin, pad_thickness_delta=0.0):
+    """`compute_touch` for taxels [F, N, 3] m of `area` [F, N] m^2 in the palm's frame, as of links all at the palm."""
+    fingers = len(taxels)
+    place, turn = jnp.zeros((fingers, 3)), jnp.tile(jnp.eye(3), (fingers, 1, 1))
+    hand = SimpleNamespace(tip_body=np.arange(fingers), taxel_position=taxels, taxel_area=area)
+    pose = HandPose(place, turn, place, turn)
+    return compute_touch(hand, pose, geometry, position, rotation, finger_force, skin, pad_thickness_delta)
 
 
 def flat_lattice(columns, rows, pitch, shift=(0.0, 0.0)):
@@ -66,12 +76,7 @@ def test_flat_punch():
 
 
 @pytest.mark.parametrize(
-    ("cover", "depth"),
-    [
-        (0.0, [0.0006, 0, 0.0013]),
-        (-0.005, [0, 0, 0.0003]),
-        (0.001, [0.0016, 0.0009, 0.0023]),
-    ],
+    ("cover", "depth"), [(0.0, [0.0006, 0, 0.0013]), (-0.005, [0, 0, 0.0003]), (0.001, [0.0016, 0.0009, 0.0023])]
 )
 def test_rubber_of_another_thickness_feels_from_elsewhere(cover, depth):
     """The margin is the rubber's thickness beyond the lattice, which is never below zero."""

@@ -65,7 +65,7 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     """Load a mesh, place it, read the hand, and push it: against finite differences, in a few lines."""
     trimesh = pytest.importorskip("trimesh")
     _, pose, *_ = links
-    ball = grid.bake(load_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03)), nodes=48)
+    ball = grid.bake(load_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03)), nodes=24)
     skin = Skin(margin=0.001)
 
     @jax.jit

@@ -35,18 +35,20 @@ class Reach:
         return jnp.stack([state["x"], jnp.float32(1.0)])
 
 
-def play(env, actions, key=0):
+ENV = adapt(Reach(), "reach")
+reset, step, restart = (jax.jit(function) for function in (ENV.reset, ENV.step, ENV.restart))
+
+
+def play(actions):
     """All states of one episode, the first included."""
-    states = [jax.jit(env.reset)(jax.random.key(key))]
-    step = jax.jit(env.step)
+    states = [reset(jax.random.key(0))]
     for action in actions:
         states.append(step(states[-1], jnp.full(1, action, jnp.float32)))
     return states
 
 
 def test_steps_are_those_of_the_environment_with_return_and_length():
-    env = adapt(Reach(), "reach")
-    states = play(env, [0.5, -1.0, 0.0])
+    states = play([0.5, -1.0, 0.0])
     begun = float(states[0].inner["x"])
     x = begun + 0.25 * np.cumsum([0.5, -1.0, 0.0])
     np.testing.assert_allclose([s.obs["actor"][0] for s in states[1:]], x, rtol=1e-6)
@@ -58,31 +60,28 @@ def test_steps_are_those_of_the_environment_with_return_and_length():
 
 
 def test_the_time_limit_truncates_and_a_terminal_state_terminates():
-    env = adapt(Reach(), "reach")
-    states = play(env, [0.0] * MAX_STEPS)
+    states = play([0.0] * MAX_STEPS)
     assert [bool(s.truncated) for s in states] == [False] * MAX_STEPS + [True]
     assert not states[-1].terminated
-    away = play(env, [np.sign(states[0].inner["x"])] * MAX_STEPS)
+    away = play([np.sign(states[0].inner["x"])] * MAX_STEPS)
     first = next(i for i, s in enumerate(away) if s.terminated)
     assert abs(away[first].inner["x"]) > 2 >= abs(away[first - 1].inner["x"])
     # In the last step of an episode, what terminates it is no time limit.
     late = dataclasses.replace(away[first - 1], clock=jnp.int32(MAX_STEPS - 1))
-    ended = env.step(late, jnp.sign(late.inner["x"])[None])
+    ended = step(late, jnp.sign(late.inner["x"])[None])
     assert ended.terminated and not ended.truncated
 
 
 def test_restart_is_a_new_episode_where_asked():
-    env = adapt(Reach(), "reach")
-    state = play(env, [0.3, 0.3])[-1]
-    same, fresh = (jax.jit(env.restart)(state, jnp.bool_(done)) for done in (False, True))
+    state = play([0.3, 0.3])[-1]
+    same, fresh = (restart(state, jnp.bool_(done)) for done in (False, True))
     assert same.inner["x"] == state.inner["x"] != fresh.inner["x"]
     assert fresh.clock == 0 and fresh.metrics["length"] == 0 and same.clock == 2
-    assert jax.jit(env.restart)(same, jnp.bool_(True)).inner["x"] != fresh.inner["x"], "keys advance either way"
+    assert restart(same, jnp.bool_(True)).inner["x"] != fresh.inner["x"], "keys advance either way"
 
 
 def test_complete_environments_are_left_alone():
     """That `make_train` adapts is shown by `docs/any_environment.md`, whose example runs."""
-    env = adapt(Reach(), "reach")
-    assert adapt(env, "other") is env and adapt(Reach()).name == "Reach"
+    assert adapt(ENV, "other") is ENV and adapt(Reach()).name == "Reach"
     with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
         adapt({}, "nothing")

@@ -1,4 +1,4 @@
-"""The objective of one iteration, from raw experience to the loss, against float64 NumPy, one sample at a time.
+"""The objective of one iteration, from raw experience to the loss, against float64 NumPy.
 
 Normalisers, networks, advantages, value targets and loss together: parts that are each right may still not fit. The
 environment plays back a script, so all but the sampled actions is known beforehand.
@@ -122,106 +122,80 @@ def double(tree):
 
 
 class Reference:
-    """PPO's objective in float64, from the script and the actions that were drawn; nothing of the library's."""
+    """PPO's objective in float64 NumPy, from the script and the actions [T, B, A] that were drawn; nothing of the
+    library's."""
 
     def __init__(self, script, config, params, stats, value_stats, actions):
-        self.config, self.stats = config, double(stats)
+        self.config, self.stats, self.layout = config, double(stats), script.observation_layout
         self.old, self.actions = double(params), np.asarray(actions, np.float64)
         self.mean, self.std = float(value_stats.mean), math.sqrt(float(value_stats.variance) + 1e-6)
-        self.layout, self.count = script.observation_layout, int(value_stats.count)
-        self.samples = self.advantages(script)
+        self.count = int(value_stats.count)
+        self.estimate_advantages(script)
 
     def seen(self, group, obs):
-        """Normalised observation."""
-        out, at = [], 0
-        for field in self.layout[group]:
-            for k in range(at, at + field.size):
-                if field.scale:
-                    z = obs[k] / field.scale
-                else:
-                    floor = self.config.observation_std_floor
-                    z = (obs[k] - self.stats[group].mean[k]) / math.hypot(
-                        math.sqrt(self.stats[group].variance[k]), floor
-                    )
-                out.append(min(max(z, -self.config.observation_clip), self.config.observation_clip))
-            at += field.size
-        return np.array(out)
+        """Normalised observation [..., n]."""
+        scale = np.concatenate([[field.scale or np.nan] * field.size for field in self.layout[group]])
+        spread = np.hypot(np.sqrt(self.stats[group].variance), self.config.observation_std_floor)
+        z = np.where(np.isnan(scale), (obs - self.stats[group].mean) / spread, obs / scale)
+        return np.clip(z, -self.config.observation_clip, self.config.observation_clip)
 
     def network(self, layers, x):
-        for k, layer in enumerate(layers):
+        for layer in layers[:-1]:
             x = x @ layer.kernel + layer.bias
-            if k < len(layers) - 1:
-                x = np.array([v if v > 0 else math.exp(v) - 1 for v in x])
-        return x
+            x = np.where(x > 0, x, np.exp(x) - 1)
+        return x @ layers[-1].kernel + layers[-1].bias
 
-    def value(self, params, obs):
-        """In reward units, by the statistics that the critic has learnt with."""
-        return self.mean + self.std * self.network(params.critic, self.seen("critic", obs))[0]
+    def critic(self, params, obs):
+        return self.network(params.critic, self.seen("critic", obs))[..., 0]
 
-    def advantages(self, script):
-        """Of every sample: the script's place and action, old mean and value, advantage and value target."""
-        c, samples = self.config, []
-        for row in range(ROWS):
-            time, chain = 0, []
-            for tick in range(STEPS):
-                obs, after = ({g: v[t, row] for g, v in script.obs.items()} for t in (time, time + 1))
-                terminated, truncated = script.terminated[time, row], script.truncated[time, row]
-                value, following = (self.value(self.old, o["critic"]) for o in (obs, after))
-                delta = script.reward[time, row] + (0.0 if terminated else c.discount * following) - value
-                chain.append((delta, terminated or truncated))
-                mean = self.network(self.old.actor, self.seen("actor", obs["actor"]))
-                samples.append({"obs": obs, "action": self.actions[tick, row], "mean": mean, "value": value})
-                time = 0 if terminated or truncated else time + 1
-            for tick in range(STEPS):  # The sum over later steps, written out.
-                total, weight = 0.0, 1.0
-                for delta, ended in chain[tick:]:
-                    total, weight = total + weight * delta, weight * c.discount * c.gae_lambda
-                    if ended:
-                        break
-                sample = samples[row * STEPS + tick]
-                sample["advantage"], sample["target"] = total, total + sample["value"]
-        advantages, targets = (np.array([s[name] for s in samples]) for name in ("advantage", "target"))
-        for sample in samples:
-            sample["advantage"] = (sample["advantage"] - advantages.mean()) / advantages.std()
-        size = self.count + len(targets)  # Of all targets so far, these among them.
-        self.new_mean = (self.count * self.mean + targets.sum()) / size
-        squares = self.count * (self.std**2 - 1e-6 + self.mean**2) + np.sum(targets**2)
+    def actor(self, params):
+        return self.network(params.actor, self.seen("actor", self.obs["actor"]))
+
+    def estimate_advantages(self, script):
+        """Of every sample [T, B]: what is seen, the old value in reward units, advantage and value target."""
+        config, rows, time = self.config, np.arange(ROWS), np.zeros((STEPS, ROWS), int)
+        ends = script.terminated | script.truncated
+        for tick in range(1, STEPS):
+            time[tick] = np.where(ends[time[tick - 1], rows], 0, time[tick - 1] + 1)
+        self.obs, after = ({group: x[t, rows] for group, x in script.obs.items()} for t in (time, time + 1))
+        # By the statistics that the critic has learnt with.
+        self.value, following = (self.mean + self.std * self.critic(self.old, x["critic"]) for x in (self.obs, after))
+        following = np.where(script.terminated[time, rows], 0.0, following)
+        delta, ended = script.reward[time, rows] + config.discount * following - self.value, ends[time, rows]
+        total = np.zeros((STEPS, ROWS))
+        for tick in range(STEPS):  # The sum over later steps, written out.
+            weight = np.ones(ROWS)
+            for later in range(tick, STEPS):
+                total[tick] += weight * delta[later]
+                weight = weight * ~ended[later] * config.discount * config.gae_lambda
+        self.advantage, self.target = (total - total.mean()) / total.std(), total + self.value
+        size = self.count + total.size  # Of all targets so far, these among them.
+        self.new_mean = (self.count * self.mean + self.target.sum()) / size
+        squares = self.count * (self.std**2 - 1e-6 + self.mean**2) + np.sum(self.target**2)
         self.new_std = math.sqrt(squares / size - self.new_mean**2 + 1e-6)
-        return samples
 
     def __call__(self, params):
-        c, surrogate, value_loss, bounds = self.config, 0.0, 0.0, 0.0
-        old_std, std = np.exp(self.old.log_std), np.exp(params.log_std)
-        for s in self.samples:
-            mean = self.network(params.actor, self.seen("actor", s["obs"]["actor"]))
-            ratio = 1.0
-            for k in range(ACTIONS):
-                new = math.exp(-((s["action"][k] - mean[k]) ** 2) / (2 * std[k] ** 2)) / std[k]
-                ratio *= new / (math.exp(-((s["action"][k] - s["mean"][k]) ** 2) / (2 * old_std[k] ** 2)) / old_std[k])
-            good = s["advantage"] > 0
-            surrogate += s["advantage"] * (min(ratio, 1 + c.clip_ratio) if good else max(ratio, 1 - c.clip_ratio))
-            value = self.network(params.critic, self.seen("critic", s["obs"]["critic"]))[0]
-            old, target = ((s[name] - self.new_mean) / self.new_std for name in ("value", "target"))
-            errors = [(value - target) ** 2]
-            if c.value_clip:
-                errors.append((min(max(value, old - c.value_clip), old + c.value_clip) - target) ** 2)
-            value_loss += 0.5 * max(errors)
-            for k in range(ACTIONS):
-                bounds += max(abs(mean[k]) - 1.1, 0.0) ** 2
-        count = len(self.samples)
-        entropy = sum(math.log(s) + 0.5 * math.log(2 * math.pi * math.e) for s in std)
-        total = -surrogate + c.value_coefficient * value_loss + c.bounds_coefficient * bounds
-        return total / count - c.entropy_coefficient * entropy
+        c, mean, advantage = self.config, self.actor(params), self.advantage
+        density = lambda m, s: np.exp(-((self.actions - m) ** 2) / (2 * s**2)) / s  # noqa: E731
+        std = np.exp(params.log_std)
+        ratio = np.prod(density(mean, std) / density(self.actor(self.old), np.exp(self.old.log_std)), -1)
+        bounded = np.where(advantage > 0, np.minimum(ratio, 1 + c.clip_ratio), np.maximum(ratio, 1 - c.clip_ratio))
+        value = self.critic(params, self.obs["critic"])
+        old, target = ((x - self.new_mean) / self.new_std for x in (self.value, self.target))
+        errors = [(value - target) ** 2]
+        if c.value_clip:
+            errors.append((np.clip(value, old - c.value_clip, old + c.value_clip) - target) ** 2)
+        value_loss = 0.5 * np.max(errors, 0)
+        bounds = np.sum(np.maximum(np.abs(mean) - 1.1, 0.0) ** 2, -1)
+        entropy = np.sum(np.log(std) + 0.5 * math.log(2 * math.pi * math.e))
+        losses = -advantage * bounded + c.value_coefficient * value_loss + c.bounds_coefficient * bounds
+        return losses.mean() - c.entropy_coefficient * entropy
 
     def divergence(self, params):
         """KL divergence of the new policy from the old one, which the learning rate adapts to."""
-        total, old_std, std = 0.0, np.exp(self.old.log_std), np.exp(params.log_std)
-        for s in self.samples:
-            mean = self.network(params.actor, self.seen("actor", s["obs"]["actor"]))
-            for k in range(ACTIONS):
-                spread = old_std[k] ** 2 + (s["mean"][k] - mean[k]) ** 2
-                total += math.log(std[k] / old_std[k]) + spread / (2 * std[k] ** 2) - 0.5
-        return total / len(self.samples)
+        old_std, std = np.exp(self.old.log_std), np.exp(params.log_std)
+        spread = old_std**2 + (self.actor(self.old) - self.actor(params)) ** 2
+        return np.sum(np.log(std / old_std) + spread / (2 * std**2) - 0.5, -1).mean()
 
 
 @pytest.mark.parametrize("options", [{}, {"value_clip": 0.0}], ids=["clipped values", "plain values"])
@@ -250,6 +224,5 @@ def test_the_critics_values_survive_the_new_statistics():
     actions, start, *_ = experience(script, config, params, stats, value_stats, jax.random.key(5))(step)
     reference = Reference(script, config, params, stats, value_stats, actions)
     assert abs(reference.new_std / reference.std - 1) > 0.1
-    for sample in reference.samples:
-        after = reference.network(double(start).critic, reference.seen("critic", sample["obs"]["critic"]))[0]
-        assert reference.new_mean + reference.new_std * after == pytest.approx(sample["value"], abs=1e-4)
+    after = reference.new_mean + reference.new_std * reference.critic(double(start), reference.obs["critic"])
+    np.testing.assert_allclose(after, reference.value, atol=1e-4)

@@ -1,12 +1,13 @@
 """What an iteration does around the loss: shuffling, clipping, statistics, the actions that the environment gets."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_env import CONFIG, SMALL, TinyEnv, training_of
+from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.distribution import Decision
@@ -15,8 +16,9 @@ from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats
 from dexsim_ppo.learner.update import Learner
 
-UPDATES = dataclasses.replace(SMALL, epochs=3, minibatches=4, kl_target=0.0)  # of 64 rows
-RATE, BLOCKS = UPDATES.learning_rate, 2
+UPDATES = dataclasses.replace(SMALL, epochs=3, minibatches=4, kl_target=0.0)
+RATE, COUNT, BLOCKS = UPDATES.learning_rate, UPDATES.steps_per_iteration, 2
+apply_gradients = jax.jit(functools.partial(update.apply_gradients, UPDATES))
 
 
 @pytest.fixture(scope="module")
@@ -25,31 +27,36 @@ def learner():
     return Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
 
 
+def numbered(blocks):
+    """Samples in blocks, whose advantage is their number."""
+    number, action = jnp.arange(COUNT, dtype=jnp.float32), jnp.zeros((COUNT, 1))
+    samples = Samples({}, Decision(action, action, number), number, number, number)
+    return jax.tree.map(lambda x: x.reshape(blocks, COUNT // blocks, *x.shape[1:]), samples)
+
+
 @pytest.fixture
 def updates(learner, monkeypatch):
     """The rows of every minibatch, and the metrics of an update under a loss that only lowers the deviation."""
-    rows, count = [], UPDATES.steps_per_iteration
+    rows = []
 
     def downward(params, config, normalizers, batch, old_log_std):
         jax.debug.callback(lambda x: rows.append(np.asarray(x).astype(int)), batch.advantage, ordered=True)
         return jnp.sum(params.log_std), {"kl": jnp.sum(old_log_std - params.log_std)}
 
     monkeypatch.setattr(update, "loss", downward)
-    number, action = jnp.arange(count, dtype=jnp.float32), jnp.zeros((count, 1))
-    samples = Samples({}, Decision(action, action, number), number, number, number)
-    samples = jax.tree.map(lambda x: x.reshape(BLOCKS, count // BLOCKS, *x.shape[1:]), samples)
-    _, metrics = update.update(UPDATES, {}, samples, jax.random.key(2), learner)
+    _, metrics = update.update(UPDATES, {}, numbered(BLOCKS), jax.random.key(2), learner)
     jax.effects_barrier()
     return rows, metrics
 
 
 def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
-    """And every minibatch as many rows of each block."""
-    rows, count = updates[0], UPDATES.steps_per_iteration
+    """And every minibatch as many rows of each block. The divergence is that of the last epoch: each update lowers
+    log_std by the learning rate (Adam under a constant gradient)."""
+    rows, metrics = updates
     assert len(rows) == UPDATES.epochs * UPDATES.minibatches
-    epochs = np.concatenate(rows).reshape(UPDATES.epochs, count)
-    np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(count), (UPDATES.epochs, 1)))
-    of_block = count // BLOCKS
+    epochs = np.concatenate(rows).reshape(UPDATES.epochs, COUNT)
+    np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(COUNT), (UPDATES.epochs, 1)))
+    of_block = COUNT // BLOCKS
     for minibatch in rows:
         np.testing.assert_array_equal(np.bincount(minibatch // of_block), [len(minibatch) // BLOCKS] * BLOCKS)
     for block in range(BLOCKS):
@@ -57,13 +64,9 @@ def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
         for order in (*mine, mine[0][mine[1].argsort()]):
             far = np.corrcoef(order, np.arange(of_block))[0, 1]
             assert abs(far) < 0.5, "shuffled, and not alike in two epochs"
-
-
-def test_the_divergence_is_that_of_the_last_epoch(updates):
-    """Each update lowers log_std by the learning rate (Adam under a constant gradient)."""
     first = (UPDATES.epochs - 1) * UPDATES.minibatches
     expected = RATE * np.mean(first + np.arange(UPDATES.minibatches))
-    assert float(updates[1]["kl"]) == pytest.approx(expected, rel=1e-2)
+    assert float(metrics["kl"]) == pytest.approx(expected, rel=1e-2)
 
 
 def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
@@ -75,10 +78,7 @@ def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
         return found * jnp.sum(params.log_std), {"kl": found, "value_loss": 2 * found}
 
     monkeypatch.setattr(update, "loss", broken)
-    number, action = jnp.arange(config.steps_per_iteration, dtype=jnp.float32), jnp.zeros((64, 1))
-    samples = Samples({}, Decision(action, action, number), number, number, number)
-    one_block = jax.tree.map(lambda x: x[None], samples)
-    after, metrics = update.update(config, {}, one_block, jax.random.key(1), learner)
+    after, metrics = update.update(config, {}, numbered(1), jax.random.key(1), learner)
     assert int(after.skipped_updates) == config.epochs, "row 5 is in one minibatch of each epoch"
     assert float(metrics["kl"]) == 1.0 and float(metrics["value_loss"]) == 2.0
     assert float(after.learning_rate) == pytest.approx(RATE / 1.5)
@@ -87,28 +87,34 @@ def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
 
 @pytest.mark.parametrize("part", ["actor", "log_std", "critic"])
 def test_nothing_moves_where_one_part_of_the_gradient_is_not_finite(learner, part):
-    grads = jax.tree.map(jnp.ones_like, learner.params)
-    grads = dataclasses.replace(
-        grads, **{part: jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), getattr(grads, part))}
-    )
-    after, _ = update.apply_gradients(UPDATES, learner, grads)
+    broken = jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), getattr(learner.params, part))
+    grads = dataclasses.replace(jax.tree.map(jnp.ones_like, learner.params), **{part: broken})
+    after, _ = apply_gradients(learner, grads)
     assert int(after.skipped_updates) == int(learner.skipped_updates) + 1
     jax.tree.map(np.testing.assert_array_equal, (after.params, after.adam), (learner.params, learner.adam))
 
 
-def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
+@pytest.mark.parametrize(("long", "short"), [("actor", "critic"), ("critic", "actor")])
+def test_actor_and_critic_are_each_clipped_to_the_norm(learner, long, short):
     """A long gradient of one does not shorten the other's."""
-    for long in ("actor", "critic"):
-        grads = jax.tree.map(lambda x: jnp.full_like(x, 1e-3), learner.params)
-        grads = dataclasses.replace(grads, **{long: jax.tree.map(lambda x: 1e6 * x, getattr(grads, long))})
-        after, norms = update.apply_gradients(UPDATES, learner, grads)
-        for part in ("actor", "critic"):
-            moments = np.concatenate([np.ravel(x) for x in jax.tree.leaves(getattr(after.adam.mean, part))])
-            if part == long:
-                assert np.linalg.norm(moments) == pytest.approx(0.1 * UPDATES.max_grad_norm, rel=1e-3)
-                assert float(norms[f"{part}_grad_norm"]) > 1e3
-            else:
-                np.testing.assert_allclose(moments, 0.1 * 1e-3, rtol=1e-3)
+    grads = jax.tree.map(lambda x: jnp.full_like(x, 1e-3), learner.params)
+    grads = dataclasses.replace(grads, **{long: jax.tree.map(lambda x: 1e6 * x, getattr(grads, long))})
+    after, norms = apply_gradients(learner, grads)
+    clipped, whole = (
+        np.concatenate([np.ravel(x) for x in jax.tree.leaves(getattr(after.adam.mean, part))]) for part in (long, short)
+    )
+    assert np.linalg.norm(clipped) == pytest.approx(0.1 * UPDATES.max_grad_norm, rel=1e-3)
+    assert float(norms[f"{long}_grad_norm"]) > 1e3
+    np.testing.assert_allclose(whole, 0.1 * 1e-3, rtol=1e-3)
+
+
+def test_log_std_stays_between_floor_and_cap(learner):
+    learner = learner._replace(learning_rate=jnp.float32(1.0))
+    for sign, bound in ((1.0, UPDATES.std_min), (-1.0, UPDATES.std_max)):
+        moved, grads = learner, jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), learner.params)
+        for _ in range(5):
+            moved, _ = apply_gradients(moved, grads)
+        np.testing.assert_allclose(jnp.exp(moved.params.log_std), bound, rtol=1e-5)
 
 
 # Actions beyond what the environment takes; one update.
@@ -162,21 +168,17 @@ def test_the_environment_gets_the_action_clipped():
 
 def test_training_begins_amid_episodes():
     """Else all of them would reach the time limit together."""
-    state = training_of(CONFIG).init(jax.random.key(0))
+    state = training_of().init(jax.random.key(0))
     clocks = np.asarray(state.env_state.metrics["length"])
-    assert len(np.unique(clocks)) > 16 and clocks.min() < 8 and clocks.max() > 24
-    assert len(np.unique(state.env_state.x)) == 64
-
-
-def experience(reward):
-    zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
-    return Rollout({}, None, zero, zero, reward, flag, flag)
+    assert len(np.unique(clocks)) > 8 and clocks.min() < 8 and clocks.max() > 24
+    assert len(np.unique(state.env_state.x)) == SMALL.num_envs
 
 
 def test_rewards_beyond_a_hundred_deviations_of_returns_are_bounded_and_others_stay_to_the_last_bit():
     stats = RunningStats(jnp.int32(9), jnp.float32(0), jnp.float32(25))
     reward = jax.random.normal(jax.random.key(1), (16, 64)).at[1, 2].set(450.0).at[2, 3].set(-1500.0)
-    bounded, count = bound_rewards(experience(reward), stats)
+    zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
+    bounded, count = jax.jit(bound_rewards)(Rollout({}, None, zero, zero, reward, flag, flag), stats)
     assert float(count) == 1
     np.testing.assert_allclose(bounded.reward[2, 3], -500.0, rtol=1e-5)
     np.testing.assert_array_equal(bounded.reward, reward.at[2, 3].set(bounded.reward[2, 3]))

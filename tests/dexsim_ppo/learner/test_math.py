@@ -28,6 +28,10 @@ class TestRunningStats:
         stats, _ = jax.lax.scan(lambda s, _: (merged(s, jnp.full((64, 1024), 2.0)), None), full, None, length=10_000)
         assert int(stats.count) > 0 and float(stats.mean) == pytest.approx(2.0, rel=0.02)
 
+    def test_a_column_that_is_not_finite_stays_unchanged(self):
+        stats = merged(init_stats((2,)), jnp.array([[1.0, 2.0], [3.0, jnp.nan]]))
+        np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
+
 
 class TestAdam:
     def test_against_numpy(self):

@@ -12,7 +12,7 @@ from dexsim_ppo.evaluate import evaluate_policy
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.loss import actor_mean, critic_value
+from dexsim_ppo.learner.loss import actor_mean
 from dexsim_ppo.learner.networks import GRU, Layer, step_memory
 from dexsim_ppo.policy import Policy
 
@@ -71,13 +71,9 @@ def experience(kind):
 
     @jax.jit
     def collect(state):
-        normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         after, rollout, _ = ppo.collect_rollout(env, config, state)
-        samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
-        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # the blocks, one after another
-        mean = actor_mean(config, params, normalizers, samples)
-        value = critic_value(config, params, normalizers, samples.obs, samples.carry)
-        return after, rollout, samples, mean, value
+        samples, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
+        return after, rollout, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # blocks one after another
 
     return jax.device_get(collect(state))
 
@@ -97,7 +93,7 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
 
 
 def test_every_episode_begins_with_an_empty_memory_and_only_then():
-    (_, last), rollout, *_ = experience("gru")
+    (_, last), rollout, _ = experience("gru")
     ended = rollout.terminated | rollout.truncated
     later = np.concatenate([rollout.carry[1:], last[None]])
     assert 0 < ended.sum() < ended.size and ended[:-1].any(), "episodes that end within the rollout"
@@ -127,7 +123,7 @@ def test_a_gated_recurrent_unit_is_that_of_its_equations():
 def test_gradients_go_back_through_the_rollout():
     """A step's error reaches what an earlier observation did, but not across an episode's start."""
     env, config, _, state = learner("gru")
-    *_, samples, _, _ = experience("gru")
+    *_, samples = experience("gru")
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def last(obs, first):

@@ -38,6 +38,7 @@ def start_two(*options):
         port = str(free.getsockname()[1])
     job = {"SLURM_JOB_ID": "1", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2", "JAX_COORDINATOR_PORT": port}
     path = {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}", "PYTHONUNBUFFERED": "1"}
+    path["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "").replace("device_count=2", "device_count=1")
     command = [sys.executable, str(ROOT / "tests/support/tiny_train.py"), *map(str, options), "--devices", "2"]
     numbers = [{"SLURM_PROCID": str(i), "SLURM_LOCALID": str(i)} for i in range(2)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

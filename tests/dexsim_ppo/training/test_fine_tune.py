@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import tiny_train
 from test_train import QUICK, exit_code
-from tiny_env import CONFIG, SMALL, TinyEnv, training_of
+from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim_ppo import train
-from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
@@ -21,9 +20,9 @@ from dexsim_ppo.training.runlog import RunFolder, read_metrics
 @pytest.fixture(scope="module")
 def policy():
     """The integrator, hardly trained."""
-    training = training_of(CONFIG)
+    training = training_of()
     state, _ = training.step(training.init(jax.random.key(0)))
-    return Policy.from_training(TinyEnv(), CONFIG, state)
+    return Policy.from_training(TinyEnv(), SMALL, state)
 
 
 @pytest.fixture
@@ -32,7 +31,7 @@ def tiny_task(monkeypatch):
 
 
 def started(policy, config):
-    training = make_train(TinyEnv(), config)
+    training = training_of(config)
     return training, initialize_from(policy, config, training.init(jax.random.key(1)))
 
 
@@ -92,10 +91,7 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
     for arguments, said in (
         (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
         (["--policy", "nothing.msgpack"], "cannot be read"),
-        (
-            ["--policy", "other.msgpack"],
-            "the policy expects position_2 [1]",
-        ),
+        (["--policy", "other.msgpack"], "the policy expects position_2 [1]"),
         (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "actor_layers = (7,): the policy has"),
         (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "memory = gru: the policy has none"),
     ):

@@ -4,15 +4,12 @@ import json
 import sys
 from types import SimpleNamespace
 
-import jax.numpy as jnp
+import jax
 import pytest
-from tiny_env import SMALL, TinyConfig
+from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.errors import CheckpointError
-from dexsim.core.layout import LayoutEntry
-from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.policy import Policy, PolicyParams
+from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_metrics
@@ -36,24 +33,15 @@ def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
     assert kept() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
 
 
-def policy_after(iteration):
-    """A small policy that was saved after so many iterations."""
-    layer = Layer(jnp.zeros((2, 1)), jnp.zeros(1))
-    params = PolicyParams((layer,), Normalizer(jnp.zeros(2), jnp.ones(2), 5.0))
-    layout, training = (LayoutEntry("joint_position", 2, None),), {"iteration": iteration}
-    return Policy(
-        task="tiny", env_config={}, observation_layout=layout, params=params, control_rate=20.0, training=training
-    )
-
-
 def test_what_is_set_aside_is_never_replaced(tmp_path):
     """Of every course that an older checkpoint's resume ends: its later checkpoints, and its best policy."""
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
+    policy = Policy.from_training(TinyEnv(), SMALL, training_of().init(jax.random.key(0)), {"iteration": 8})
     for course in ("first", "second", "third"):
         for iteration in (4, 8):
             folder.checkpoint(iteration).write_text(course)
-        policy_after(8).save(folder.best)
+        policy.save(folder.best)
         folder.set_aside(8)
         assert folder.best.exists() and len(folder.existing_checkpoints()) == 2, "all of it is before or at 8"
         folder.set_aside(6)

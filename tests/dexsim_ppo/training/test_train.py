@@ -1,21 +1,24 @@
-"""The two commands on the tiny task: what they write, how they resume, how they refuse."""
+"""The two commands on the tiny task: what they write, how they resume and refuse, and how a diverging run ends."""
 
+import dataclasses
 import json
 import os
+import shutil
 import signal
 import threading
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_train
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import TinyConfig, TinyEnv, make_env, make_evaluator
 from tiny_train import PER_ITERATION
 
 from dexsim.core import cli
-from dexsim.core.errors import OtherEnvWarning
-from dexsim_ppo import evaluate, train
+from dexsim.core.errors import ConfigError, DexsimError, OtherEnvWarning
+from dexsim_ppo import checkpoint, evaluate, train
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.runlog import RunFolder, policy_of, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
@@ -53,7 +56,7 @@ def test_a_run_leaves_its_files(finished):
     assert report["timing"]["env_steps_per_s"] > 5 * PER_ITERATION / report["timing"]["training_s"]
     assert report["hardware"]["cpu_cores"] and report["versions"]["jax"] and "dexsim_ppo.train" in report["command"]
     policy, rows = load_policy(finished.best, task="tiny"), [row for row in rows if row.get("evaluation/return")]
-    measured, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
+    measured, _ = make_evaluator(make_env(TinyEnv, TinyConfig()), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
     assert measured["return"]["value"] >= max(row["evaluation/return"] for row in rows) - 1e-4
 
 
@@ -64,6 +67,46 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
     a, b = load_policy(finished.last), load_policy(RunFolder(path).last)
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     assert [r["iteration"] for r in read_metrics(RunFolder(path).metrics)] == [1, 2, 4, 6]
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """The finished run, in a folder that may be changed."""
+    return RunFolder(shutil.copytree(finished.path, tmp_path / "a"))
+
+
+def test_a_resumed_run_may_change_its_budget_and_keeps_every_report(copied):
+    first = json.loads(copied.report.read_text())
+    same = ["--seed", "0", "--ppo.learning-rate", "5e-4"]
+    looks_on = ["--steps", str(7 * PER_ITERATION), "--evaluation-episodes", "32", "--log-every", "3"]
+    assert train.main(["--resume", str(copied.path), *same, *looks_on]) == 0
+    assert json.loads((copied.path / "report-1.json").read_text()) == first
+    report = json.loads(copied.report.read_text())
+    assert report["seed"] == 0 and report["trained"]["episodes"] == 32
+    assert load_policy(copied.last).training["iteration"] == 7
+    saved = checkpoint.load(copied.latest_checkpoint(), kind="train").content["arguments"]
+    assert (saved["seed"], saved["log_every"], saved["evaluation_episodes"]) == (0, 3, 32)
+
+
+def test_an_older_checkpoint_is_resumed_for_good(copied):
+    """The later ones are of another course: kept under another name, so that the next resume does not go back to it."""
+    first, later = copied.existing_checkpoints()
+    assert later == copied.latest_checkpoint() == copied.checkpoint(6)
+    content = later.read_bytes()
+    assert train.main(["--resume", str(first), "--steps", str(4 * PER_ITERATION), "--keep-checkpoints", "1"]) == 0
+    assert copied.latest_checkpoint() == copied.checkpoint(4)
+    assert (copied.checkpoints / "00000006.aside1.msgpack").read_bytes() == content
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_run_that_is_being_trained_is_left_alone(finished):
+    before, further = contents(finished), ["--resume", str(finished.path), "--steps", str(7 * PER_ITERATION)]
+    with finished.lock(), pytest.raises(ConfigError, match=r"/a: another process is training this run$"):
+        train.main(further)
+    assert contents(finished) == before
 
 
 def test_evaluate_command(finished, tmp_path, capsys):
@@ -111,7 +154,6 @@ EVALUATE_ERRORS = {
     "output that is a folder": (["BEST", "--output", "."], "Is a directory"),
 }
 ERRORS = {f"train: {what}": (train.main, *case) for what, case in TRAIN_ERRORS.items()}
-PARSING = {"train: wrong type"}
 ERRORS |= {f"evaluate: {what}": (evaluate.main, *case) for what, case in EVALUATE_ERRORS.items()}
 
 
@@ -120,7 +162,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(what, finished, tmp_path, 
     monkeypatch.chdir(tmp_path)
     main, arguments, words = ERRORS[what]
     (tmp_path / "broken.msgpack").write_bytes(finished.best.read_bytes()[:-9])
-    before = {p: p.read_bytes() for p in finished.path.rglob("*") if p.is_file()}
+    before = contents(finished)
     names = {"RUN": str(finished.path), "BEST": str(finished.best)}
     arguments = [names.get(argument, argument) for argument in arguments]
     if main is train.main and "--task" not in arguments:
@@ -129,14 +171,15 @@ def test_a_mistake_is_one_line_and_nothing_is_written(what, finished, tmp_path, 
     error = capsys.readouterr().err
     assert words.lower() in error.lower(), error
     # What does not parse is tyro's to explain, in a box of several lines.
-    assert what in PARSING or error.count("\n") == 1 and error.startswith("error: "), error
-    assert before == {p: p.read_bytes() for p in finished.path.rglob("*") if p.is_file()}
+    assert what == "train: wrong type" or error.count("\n") == 1 and error.startswith("error: "), error
+    assert before == contents(finished)
     assert [p.name for p in tmp_path.iterdir()] == ["broken.msgpack"]
 
 
-def test_another_environment_than_the_policys_is_warned_of(finished):
+def test_another_environment_than_the_policys_is_warned_of(finished, monkeypatch):
+    monkeypatch.setattr(evaluate, "_measure", lambda *_: ({}, None))
     with pytest.warns(OtherEnvWarning, match=r"gain = 0\.5 \(trained: 0\.25\)"):
-        evaluate.evaluate_policy(finished.best, env=TinyEnv(TinyConfig(gain=0.5)), episodes=16, chunk=16)
+        evaluate.evaluate_policy(finished.best, env=TinyEnv(TinyConfig(gain=0.5)))
 
 
 def exit_code(main, arguments):
@@ -162,3 +205,47 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys):
     assert code == 128 + signal.SIGTERM
     assert f"--resume {folder.path}" in capsys.readouterr().out.splitlines()[-1]
     assert folder.latest_checkpoint().exists()
+
+
+FAULTY = [*tiny_train.QUICK, *"--seed 3 --log-every 1".split()]
+GOOD_ITERATIONS = 3
+
+
+class Breaks(TinyEnv):
+    """From its 24th step on, the actors of environments that started on the right side observe NaN."""
+
+    def _start(self, key):
+        state = super()._start(key)
+        return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
+
+    def randomize_episode_time(self, state, key):
+        return state
+
+    def step(self, state, action):
+        age = state.metrics["age"] + 1
+        state = super().step(state, action)
+        broken = (age >= 8 * GOOD_ITERATIONS) & (state.target > 0.0)
+        actor = state.obs["actor"].at[1].set(jnp.where(broken, jnp.nan, state.obs["actor"][1]))
+        return dataclasses.replace(
+            state,
+            obs=state.obs | {"actor": actor},
+            truncated=jnp.bool_(False),
+            terminated=jnp.bool_(False),
+            metrics=state.metrics | {"age": age},
+        )
+
+
+def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch, capsys):
+    """By then the newest checkpoints hold the fault: only those up to the last sound iteration are named."""
+    tiny_train.install(monkeypatch, Breaks)
+    folder = RunFolder(tmp_path / "run")
+    options = ["--minutes", "5", "--run-dir", str(folder.path), "--checkpoint-every", "1", "--keep-checkpoints"]
+    with pytest.raises(DexsimError, match=f"after iteration {GOOD_ITERATIONS}; no checkpoint is from before"):
+        train.main([*FAULTY, *options, "3"])
+    shown = capsys.readouterr().out
+    assert f"iteration {GOOD_ITERATIONS + 1}: " in shown and "updates skipped" in shown
+    assert shown.count("gradient is not finite") == 1, "said when it begins"
+    assert min(int(path.stem) for path in folder.existing_checkpoints()) > GOOD_ITERATIONS
+    options[3] = str(tmp_path / "other")
+    with pytest.raises(DexsimError, match=f"newest checkpoint from before is .*{GOOD_ITERATIONS}.msgpack"):
+        train.main([*FAULTY, *options, "9"])
