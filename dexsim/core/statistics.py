@@ -4,11 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 
 def proportion(hits: np.ndarray) -> dict:
     """Share of True among `hits` [N], with Wilson's 95 % interval."""
+    from scipy.stats import binomtest  # A second to import, for every command.
+
     n = int(hits.size)
     if n == 0:
         return {"mean": None, "low": None, "high": None, "count": 0}

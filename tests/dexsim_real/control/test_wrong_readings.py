@@ -46,6 +46,15 @@ def test_a_wrong_angle_moves_nothing(bench, value, cycles, hold):
     assert bench.safety.counts["implausible: measurement"] == cycles
 
 
+def test_the_first_reading_after_the_motors_came_on_may_be_wrong_as_well(hand):
+    bench = Bench(hand)
+    bench.engage()
+    assert bench.cycle().mode == Mode.POSITION
+    bench.position = wrong(4, 1.5)
+    bench.cycle(follow=False)
+    assert "index_joint1 reads 1.5 rad" in bench.safety.problem
+
+
 def test_wrong_angles_that_last_turn_the_motors_off_and_name_the_joint(bench):
     bench.position = wrong(4, 1.9)
     decisions = bench.run(1.2, target=MIDDLE, follow=False)
