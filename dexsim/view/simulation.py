@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,16 @@ from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
-from dexsim.view.source import Button, Choice, Control, Frame, Slider, Values
+from dexsim.view.source import Frame, clicked
 from dexsim_ppo.policy import Policy, load_policy
-
-_ANY = "any"
-_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
-_SHOWN = 1.0  # s that a dropped object stays in sight
-
 
 NONE = "none"
 """The choice of no policy: actions are zero."""
+_ANY = "any"
+_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
+_SHOWN = 1.0  # s that a dropped object stays in sight
 _NEWEST = 20  # files of runs that are listed
+_LOOK = 3.0  # s between two looks for new ones
 
 
 class PolicyShelf:
@@ -82,52 +82,52 @@ class Simulation:
         self._snapshot = jit(functools.partial(take_snapshot, env), backend=env.backend)
         self._acting: Any = None  # the policy that the carry is of
         self._carry: Any = None
-        self._state: State = self._begin({})
+        self._state: State
 
-    def controls(self) -> dict[str, Control]:
+    def add_controls(self, gui: Any) -> None:
         """Policy, object (where the task has several), command (where it has one), friction and pushes."""
+        self._policy, self._looked_at = gui.add_dropdown("policy", self.policies.names()), time.monotonic()
         kinds = [KINDS[index] for index in np.unique(self._shapes)]
-        return {
-            "policy": Choice(self.policies.names()),
-            **({"object": Choice((_ANY, *kinds))} if len(kinds) > 1 else {}),
-            **({"command": Slider(0.0, 1.0, 0.05, 0.5)} if hasattr(self._goal, "command") else {}),
-            "friction factor": Slider(0.1, 2.0, 0.05, 1.0),
-            "push [m/s]": Slider(0.0, 2.0, 0.1, _PUSH),
-            "push": Button(),
-        }
+        self._kind = gui.add_dropdown("object", (_ANY, *kinds)) if len(kinds) > 1 else None
+        self._command = None
+        if hasattr(self._goal, "command"):
+            self._command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5)
+        self._friction = gui.add_slider("friction factor", min=0.1, max=2.0, step=0.05, initial_value=1.0)
+        self._speed = gui.add_slider("push [m/s]", min=0.0, max=2.0, step=0.1, initial_value=_PUSH)
+        self._push = gui.add_button("push")
 
-    def reset(self, values: Values) -> Frame:
-        self._state = self._begin(values)
+    def reset(self) -> Frame:
+        kind = self._kind.value if self._kind else _ANY
+        rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
+        self._key, key = jax.random.split(self._key)
+        row = self._random.choice(rows)
+        self._state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
+        object, self._ended, self._acting = self._state.episode.object, 0.0, None
+        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
         return self._frame()
 
-    def step(self, values: Values) -> Frame:
+    def step(self) -> Frame:
         if self._ended >= _SHOWN:
-            return self.reset(values)
-        policy = self.policies.get(values["policy"])
+            return self.reset()
+        if time.monotonic() > self._looked_at + _LOOK:
+            names, self._looked_at = self.policies.names(), time.monotonic()
+            if names != self._policy.options:
+                self._policy.options = names
+        policy = self.policies.get(self._policy.value)
         if policy is not self._acting:  # another one, or another episode
             self._acting, self._carry = policy, policy and policy.initial_carry()
         action = jnp.zeros(self.env.action_size)
         if policy is not None:
             self._carry, action = policy.act(self._carry, self._state.obs["actor"])
         push = np.zeros(3, np.float32)
-        if values["push"]:
+        if clicked(self._push):
             push = self._random.normal(size=3).astype(np.float32)
-            push *= np.float32(values["push [m/s]"] / np.linalg.norm(push))
-        command = np.float32(values.get("command", 0.0))
-        self._state = self._step(self._state, action, command, np.float32(values["friction factor"]), push, self._bare)
+            push *= np.float32(self._speed.value / np.linalg.norm(push))
+        command = np.float32(self._command.value if self._command else 0.0)
+        self._state = self._step(self._state, action, command, np.float32(self._friction.value), push, self._bare)
         dropped = bool(self._state.terminated) or self._ended > 0
         self._ended = self._ended + self.period if dropped else 0.0
         return self._frame("dropped" if dropped else "")
-
-    def _begin(self, values: Values) -> State:
-        kind = values.get("object", _ANY)
-        rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
-        self._key, key = jax.random.split(self._key)
-        row = self._random.choice(rows)
-        state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
-        object, self._ended, self._acting = state.episode.object, 0.0, None
-        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
-        return state
 
     def _tick(
         self, state: State, action: jax.Array, command: jax.Array, friction: jax.Array, push: jax.Array, bare: Any
@@ -144,4 +144,5 @@ class Simulation:
         return self.env.step(dataclasses.replace(state, episode=episode, physics=physics, goal=goal), action)
 
     def _frame(self, note: str = "") -> Frame:
-        return Frame(jax.device_get(self._snapshot(self._state)), self.env.primitive_kinds, note)
+        command = self._command.value if self._command else None
+        return Frame(jax.device_get(self._snapshot(self._state)), self.env.primitive_kinds, note, command)

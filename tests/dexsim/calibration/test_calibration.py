@@ -13,9 +13,8 @@ import scipy.signal
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from virtual_press import press, varied_presses
+from virtual_press import Motor, press, varied_presses
 
-from dexsim.actuator.current import Motor
 from dexsim.calibration.fit import JointPress, calibrate, fit_joint
 from dexsim.calibration.line import fit_line
 from dexsim.calibration.maps import (
@@ -90,17 +89,15 @@ MOTOR = Motor(
     back_efficiency=0.7,
     no_load_current=0.02,
     ripple=0.02,
-    ripple_count=300.0,
     bias=0.004,
     noise=0.004,
-    resolution=0.001,
 )
 LEVER = 0.06
 
 
 def recording(seed=0, motor=MOTOR, **options):
     options = {"lever": LEVER, "force_noise": 0.03, **options}
-    return press(motor, jax.random.key(seed), **options)
+    return press(motor, seed, **options)
 
 
 def test_both_lines_of_a_motor_with_losses():
