@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,48 +26,27 @@ _ANY = "any"
 _PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
 _SHOWN = 1.0  # s that a dropped object stays in sight
 _NEWEST = 20  # files of runs that are listed
-_LOOK = 3.0  # s between two looks for new ones
 
 
-class PolicyShelf:
-    """Policies that take an environment's observation, by the name of a shipped one or the path of a file, which is
-    read again when it changes. The view begins with `first`."""
-
-    def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
-        self._layout, self._runs, self._first = tuple(env.observation_layout["actor"]), runs, first
-        self._shipped = sorted(path.stem for path in asset_path("policies").glob("*.msgpack"))
-        self._loaded: dict[str, tuple[float, Policy | None]] = {}
-
-    def names(self) -> tuple[str, ...]:
-        """What can be chosen now: the first policy, then shipped ones, then the newest files of runs."""
-        files = [path for name in ("best", "last") for path in self._runs.glob(f"*/{name}.msgpack")]
-        newest = sorted(files, key=_changed, reverse=True)[:_NEWEST]
-        listed = dict.fromkeys([self._first, *self._shipped, *map(str, newest), NONE])
-        return tuple(name for name in listed if name == NONE or self.get(name) is not None)
-
-    def get(self, name: str) -> Policy | None:
-        """The policy of this name as its file is now; None where it is unsound, does not fit, or is `NONE`."""
-        if name == NONE:
-            return None
-        time = 0.0 if name in self._shipped else _changed(Path(name))
-        read, policy = self._loaded.get(name, (-1.0, None))
-        if time != read:
-            with contextlib.suppress(CheckpointError, OSError):  # being replaced: keep its last sound policy
-                new = load_policy(name)
-                policy = new if new.observation_layout == self._layout else None
-            self._loaded[name] = time, policy
-        return policy
-
-
-def _changed(path: Path) -> float:
-    """When a file was last written, s; 0 if it is gone."""
-    return path.stat().st_mtime if path.exists() else 0.0
+def find_policies(env: Env, first: str, runs: Path = Path("runs")) -> dict[str, Policy | None]:
+    """Policies that take an environment's observation, by the name of a shipped one or the path of a file: `first`,
+    shipped ones, the newest files of `runs`, and `NONE`."""
+    shipped = sorted(path.stem for path in asset_path("policies").glob("*.msgpack"))
+    files = [path for name in ("best", "last") for path in runs.glob(f"*/{name}.msgpack")]
+    newest = sorted(files, key=lambda path: -path.stat().st_mtime)[:_NEWEST]
+    fitting: dict[str, Policy | None] = {}
+    for name in dict.fromkeys([first, *shipped, *map(str, newest), NONE]):
+        with contextlib.suppress(CheckpointError):  # damaged, or being replaced
+            policy = None if name == NONE else load_policy(name)
+            if policy is None or policy.observation_layout == tuple(env.observation_layout["actor"]):
+                fitting[name] = policy
+    return fitting
 
 
 class Simulation:
     """Episodes of an environment; the page chooses policy, object, command, friction and pushes."""
 
-    def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
+    def __init__(self, env: Env, policies: dict[str, Policy | None], seed: int = 0):
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies
         self.task = env.name
         self._random = np.random.default_rng(seed)
@@ -86,7 +64,7 @@ class Simulation:
 
     def add_controls(self, gui: Any) -> None:
         """Policy, object (where the task has several), command (where it has one), friction and pushes."""
-        self._policy, self._looked_at = gui.add_dropdown("policy", self.policies.names()), time.monotonic()
+        self._policy = gui.add_dropdown("policy", tuple(self.policies))
         kinds = [KINDS[index] for index in np.unique(self._shapes)]
         self._kind = gui.add_dropdown("object", (_ANY, *kinds)) if len(kinds) > 1 else None
         self._command = None
@@ -109,11 +87,7 @@ class Simulation:
     def step(self) -> Frame:
         if self._ended >= _SHOWN:
             return self.reset()
-        if time.monotonic() > self._looked_at + _LOOK:
-            names, self._looked_at = self.policies.names(), time.monotonic()
-            if names != self._policy.options:
-                self._policy.options = names
-        policy = self.policies.get(self._policy.value)
+        policy = self.policies[self._policy.value]
         if policy is not self._acting:  # another one, or another episode
             self._acting, self._carry = policy, policy and policy.initial_carry()
         action = jnp.zeros(self.env.action_size)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import os
 import shutil
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from dexsim.objects.config import KINDS
 from dexsim.render.picture import hand_poses
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
-from dexsim.view.simulation import NONE, PolicyShelf, Simulation
+from dexsim.view.simulation import NONE, Simulation, find_policies
 from dexsim_ppo import load_policy
 
 
@@ -64,22 +63,16 @@ def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
 # --- policies -------------------------------------------------------------------------------------------
 
 
-def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_path):
+def test_policies_are_listed_where_they_fit(tmp_path):
     grasp = load_policy("grasp")
     env = SimpleNamespace(observation_layout={"actor": grasp.observation_layout})
-    shelf = PolicyShelf(env, "grasp", tmp_path)
-    assert shelf.names() == ("grasp", NONE) and shelf.get(NONE) is None
-    for run, policy in (("mine", grasp), ("other", load_policy("rotate"))):
+    for run, policy in (("mine", grasp), ("other", load_policy("rotate")), ("half", grasp)):
         (tmp_path / run).mkdir()
         policy.save(tmp_path / run / "last.msgpack")
-    file = tmp_path / "mine" / "last.msgpack"
-    assert shelf.names() == ("grasp", str(file), NONE), "the policy of another observation is not offered"
-    assert shelf.get(str(file)).training == grasp.training
-    dataclasses.replace(grasp, training={"steps": 1}).save(file)
-    os.utime(file, (time.time() - 5,) * 2)  # also where the clock of the file system is coarse
-    assert shelf.get(str(file)).training == {"steps": 1}
-    file.write_bytes(b"half a file")
-    assert shelf.get(str(file)).training == {"steps": 1}, "a damaged file keeps the last sound policy"
+    (tmp_path / "half" / "last.msgpack").write_bytes(b"half a file")
+    policies = find_policies(env, "grasp", tmp_path)
+    assert list(policies) == ["grasp", str(tmp_path / "mine" / "last.msgpack"), NONE] and policies[NONE] is None
+    assert list(find_policies(env, NONE, tmp_path / "mine")) == [NONE, "grasp"], "begins with the one that is asked for"
 
 
 # --- sources --------------------------------------------------------------------------------------------
@@ -87,7 +80,7 @@ def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_
 
 @pytest.fixture(scope="module")
 def simulation(grasp_env):
-    source = Simulation(grasp_env, PolicyShelf(grasp_env, "grasp"), seed=3)
+    source = Simulation(grasp_env, find_policies(grasp_env, "grasp"), seed=3)
     source.gui = Gui()
     source.add_controls(source.gui)
     return source
