@@ -116,22 +116,29 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
         f"signs: {', '.join(draft.reversed)} turned round" if draft.reversed else "signs: as in the file",
         *(f"assumed: {text}" for text in draft.assumed),
     ]
+    hand = load_hand(write_hand(draft, name, remarks, folder))
     for gap in _GAPS:
-        gaps = find_grasp(draft, gap)
-        draft.finger_force = force_targets(load_hand(write_hand(draft, name, remarks, folder)))
-        path = write_hand(draft, name, remarks, folder)
+        posture, centre, gaps = find_grasp(hand, gap)
+        force = force_targets(hand, posture)
+        grasp = {"posture": posture, "centre": centre, "finger_force": force}
+        path = write_hand(draft, name, remarks, folder, grasp)
         checks, passed = report(path)
         if not any("free of overlap" in line for line in checks):
             break
-    print("\n".join([*fit_lines(draft, gaps, gap), *(f"assumed      {text}" for text in draft.assumed), *checks]))
+    held = [
+        f"force        targets of {force[0]:.1f} to {force[1]:.1f} N a finger: what the thumb can oppose",
+        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in centre)} mm, {np.sum(is_near(gaps, gap))} of "
+        f"{len(gaps)} fingertips near it, the farthest {1e3 * gaps.max():.0f} mm away",
+    ]
+    print("\n".join([*fit_lines(draft), *held, *(f"assumed      {text}" for text in draft.assumed), *checks]))
     return path, passed
 
 
-def force_targets(hand: Hand) -> tuple[float, float]:
-    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture, shared
-    by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand, or what
-    carries an object."""
-    thumb, *others = fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))
+def force_targets(hand: Hand, posture: np.ndarray) -> tuple[float, float]:
+    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture [J],
+    shared by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand,
+    or what carries an object."""
+    thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
     highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
     return min(max(highest / 4, _CARRYING), highest), highest
 
@@ -276,8 +283,8 @@ def _fit_pad(draft: Draft, at: int) -> Capsule:
     return capsule
 
 
-def fit_lines(draft: Draft, gaps: np.ndarray, gap: float) -> list[str]:
-    """A line for each capsule, the palm and the grasp, whose fingertips are `gaps` [F] m from the ball."""
+def fit_lines(draft: Draft) -> list[str]:
+    """A line for each capsule and the palm."""
     lines = ["capsule                 of joint                radius, fit's mean and largest error [mm]"]
     for link in draft.links:
         if link.capsule:
@@ -285,14 +292,10 @@ def fit_lines(draft: Draft, gaps: np.ndarray, gap: float) -> list[str]:
             lines.append(f"  {link.name[:20]:21} {link.joint[:20]:21} {radius:8.1f} {mean:8.1f} {most:8.1f}")
     assert draft.palm is not None, "fitted before"
     sides, face = " x ".join(f"{2e3 * x:.0f}" for x in draft.palm.half), draft.palm.centre[0] + draft.palm.half[0]
-    low, high = draft.finger_force
+    beyond = f"{1e3 * draft.palm.largest_error:.0f} mm"
     return [
         *lines,
-        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches "
-        f"{1e3 * draft.palm.largest_error:.0f} mm beyond it",
-        f"force        targets of {low:.1f} to {high:.1f} N a finger: what the thumb can oppose",
-        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in draft.centre)} mm, "
-        f"{np.sum(is_near(gaps, gap))} of {len(gaps)} fingertips near it, the farthest {1e3 * gaps.max():.0f} mm away",
+        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond} beyond it",
     ]
 
 

@@ -59,7 +59,7 @@ class Link:
 @dataclasses.dataclass(eq=False, kw_only=True)
 class Draft:
     """A hand on the way from a maker's file to a folder. `read_hand` begins it, in the file's axes; `anatomy.orient`
-    finds fingers and signs and turns it into the library's palm frame; later steps fill in the rest."""
+    finds fingers and signs and turns it into the library's palm frame; `import_hand.fit_links` fills in the rest."""
 
     name: str
     kind: str  # MJCF or URDF
@@ -74,10 +74,6 @@ class Draft:
     # From `import_hand.fit_links`.
     palm: PalmBox | None = None
     assumed: list[str] = dataclasses.field(default_factory=list)
-    # Of the first grasp, from `posture.find_grasp` and `import_hand.force_targets`.
-    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
-    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
-    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
 
     @property
     def motors(self) -> list[Link]:
