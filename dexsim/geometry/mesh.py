@@ -150,11 +150,10 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
 
 def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Random points [count, 3] m, uniform by area, with their face normals [count, 3]."""
-    share = np.cumsum(mesh.area_faces)
-    face = np.searchsorted(share, rng.uniform(0, share[-1], count)).clip(0, len(share) - 1)
-    u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
-    weight = np.stack([1 - u, u * (1 - v), u * v], -1)
-    return np.einsum("pk,pkd->pd", weight, mesh.triangles[face]), np.asarray(mesh.face_normals)[face]
+    import trimesh
+
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=rng)
+    return np.asarray(points), np.asarray(mesh.face_normals)[face]
 
 
 def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim.render.panel import FELT, Panel, read_outs
+from dexsim.render.panel import FELT, draw_panel, read_outs
 from dexsim.view.scene import Scene
 from dexsim.view.source import Frame, Source, clicked
 
@@ -29,7 +29,7 @@ class Viewer:
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
         import viser
 
-        self.source, hand = source, source.hand
+        self.source = source
         try:  # viser would wait forever
             socket.create_server((host, 0)).close()
         except OSError as error:
@@ -37,8 +37,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
-        self.scene = Scene(self.server, hand, source.task)
-        self._panel = Panel(hand, *_PANEL)
+        self.scene = Scene(self.server, source.hand, source.task)
         # The scales follow the largest taxel and finger force of the last seconds.
         self._taxel_range, self._finger_range, self._read_out_at = 0.05, 1.0, 0.0
         gui = self.server.gui
@@ -87,4 +86,5 @@ class Viewer:
         if frame.command is not None:
             words["command"] = f"{frame.command:.2f}, with the force loop {words['command']}"
         self._text.content = "  \n".join(f"{name}: **{word}**" for name, word in words.items())
-        self._maps.image = self._panel.draw(snapshot, self._taxel_range, self._finger_range, {}, FELT)
+        ranges = self._taxel_range, self._finger_range
+        self._maps.image = draw_panel(self.source.hand, _PANEL, snapshot, *ranges, {}, FELT)
