@@ -72,7 +72,9 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
         closed = (_shell if repair == "shell" else _hull)(mesh)
         mesh, given = make_mesh(f"{name} after repair", *_merge(*closed, _SAME * size)), mesh
         _check_closed(mesh, size)
-        print(f"{error}; its {repair} is {1e3 * _deviation(given, mesh):.2g} mm away", file=sys.stderr)
+        a, b = _points_on(given), _points_on(mesh)
+        away = 1e3 * max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
+        print(f"{error}; its {repair} is {away:.2g} mm away", file=sys.stderr)
     return mesh
 
 
@@ -265,9 +267,3 @@ def _points_on(mesh: Trimesh) -> np.ndarray:
     """Random points on a surface, and its corners."""
     points, _ = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
     return np.concatenate([points, mesh.vertices])
-
-
-def _deviation(one: Trimesh, other: Trimesh) -> float:
-    """The largest distance m of a point of either surface from the other one, between samples."""
-    a, b = _points_on(one), _points_on(other)
-    return float(max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max()))

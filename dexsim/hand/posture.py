@@ -5,12 +5,12 @@ Shapes: N postures tried at once, C capsules of a finger. Units: m, rad, in the 
 
 import itertools
 
-import jax
 import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.hand.fit import segment_distance
-from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics
+from dexsim.hand.kinematics import finger_bodies, flexion_joints
+from dexsim.hand.mjcf import hand_poses
 
 BALL = 0.028  # m, radius: the middle of the spheres that grasps are trained with
 _SHARES = (1.0, 0.9, 0.6, 0.6, 0.6)  # of the bend, from a finger's first flexing hinge on
@@ -107,8 +107,7 @@ def _thumb_grid(hand: Hand) -> np.ndarray:
 
 def _capsules(hand: Hand, finger: int, postures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Segments [N, C, 2, 3] and radii [C] of a finger's capsules, the tip's last, in postures [N, J]."""
-    pose = jax.vmap(lambda joints: forward_kinematics(hand, joints))(postures.astype(np.float32))
-    position, rotation = np.asarray(pose.body_position), np.asarray(pose.body_rotation)
+    position, rotation = (np.stack(x) for x in zip(*(pose[:2] for pose in hand_poses(hand, postures)), strict=True))
     ends, radii = [], []
     for body in finger_bodies(hand, finger)[-2::-1]:
         for geom in (geom for geom in hand.geoms if geom.body == body):

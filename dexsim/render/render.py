@@ -16,9 +16,10 @@ import numpy as np
 from dexsim.core.files import write_atomic
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
+from dexsim.hand.mjcf import Pose, hand_poses
 from dexsim.render.camera import Camera
 from dexsim.render.panel import draw_panel, read_outs, taxel_image
-from dexsim.render.picture import Pose, draw_scene, hand_poses
+from dexsim.render.picture import draw_scene
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {

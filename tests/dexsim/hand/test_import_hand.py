@@ -104,11 +104,14 @@ def hands(tmp_path_factory):
 class TestUrdf:
     @pytest.mark.parametrize("name", ["plain", "reversed", "left"])
     def test_palm_frame_fingers_and_side_are_found(self, hands, name):
-        draft = hands[name]
-        np.testing.assert_allclose(draft.rotation, TURN.T, atol=0.02)
-        assert list(draft.fingers) == ["thumb", "index", "middle", "ring"]
-        assert draft.side == ("left" if name == "left" else "right") and draft.frozen == ("wrist",)
-        assert draft.reversed == (("index_1", "middle_2", "thumb_2") if name == "reversed" else ())
+        draft, found = hands[name], "\n".join(hands[name].findings)
+        assert list(draft.fingers) == ["thumb", "index", "middle", "ring"] and "frozen at 0  wrist:" in found
+        assert draft.side == ("left" if name == "left" else "right")
+        assert ("reversed     index_1, middle_2, thumb_2:" in found) == (name == "reversed")
+        # In our frame fingers bend about y, and their middle joints are where they were drawn.
+        place = np.array(ROOTS["middle"]) * [1, -1 if name == "left" else 1, 1] + [0, 0, LENGTHS[0]]
+        (link,) = (link for link in draft.links if link.joint == "middle_2")
+        np.testing.assert_allclose([link.axis, link.anchor], [[0, 1, 0], place], atol=2e-3)
 
     def test_turned_joints_give_the_same_hand(self, hands):
         for link, other in zip(hands["plain"].links, hands["reversed"].links, strict=True):

@@ -14,8 +14,8 @@ import pytest
 
 from dexsim.core.assets import asset_path
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.mjcf import hand_poses
 from dexsim.objects.config import KINDS
-from dexsim.render.picture import hand_poses
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
 from dexsim.view.simulation import NONE, Simulation, find_policies
