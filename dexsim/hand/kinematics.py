@@ -36,7 +36,9 @@ def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     for body, above in enumerate(hand.body_parent):  # which comes before it
         depth[body] = 0 if above < 0 else depth[above] + 1
     roots, *deeper = [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
-    order, position, rotation = list(roots), local_position[roots], local_rotation[roots]
+    order = list(roots)
+    position: jax.Array = local_position[roots]
+    rotation: jax.Array = local_rotation[roots]
     for level in deeper:
         rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
         new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
