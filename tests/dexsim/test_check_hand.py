@@ -65,17 +65,6 @@ def inward(line):
     return [*line[:6], *(f"{-float(x):.6g}" for x in line[6:9]), line[9]]
 
 
-def edit(path, old, new):
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-
-
-def rows(path, change):
-    head, *lines = path.read_text().splitlines()
-    path.write_text("\n".join([head, *(",".join(change(line.split(","))) for line in lines)]))
-
-
 # What is changed in each line of the taxel file, and what is said of it.
 MISPLACED = {
     "millimetres": (scaled(1e3), "mm away from its link: metres, in"),
