@@ -122,7 +122,7 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
             f"a mesh of {1000 * float((high - low).max()):.0f} mm has no inside at a resolution of {1000 * pitch:.1f} "
             "mm: its walls are too thin for boxes; give it as a solid"
         )
-    boxes: list[tuple[np.ndarray, np.ndarray]] = []
+    boxes: list[np.ndarray] = []
     for _ in range(parts):
         if left.sum() < 0.01 * inside.sum():
             break
@@ -130,37 +130,29 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
         chosen = rng.choice(len(seeds), min(_SEEDS, len(seeds)), replace=False, p=depth / depth.sum())
         grown = [_grow_one(inside, seeds[index], rng) for index in chosen]
         gain = [int(np.sum(left[_cut(box)])) - int(np.sum(~inside[_cut(box)])) for box in grown]
-        best = grown[int(np.argmax(gain))]
-        left[_cut(best)] = False
-        boxes.append(best)
+        boxes.append(grown[int(np.argmax(gain))])
+        left[_cut(boxes[-1])] = False
     corners = np.array(boxes)
-    return low + corners[:, 0] * cell, low + corners[:, 1] * cell
+    return low + corners[..., 0] * cell, low + corners[..., 1] * cell
 
 
-def _cut(box: tuple[np.ndarray, np.ndarray]) -> tuple[slice, ...]:
-    return tuple(slice(a, b) for a, b in zip(*box, strict=True))
+def _cut(box: np.ndarray) -> tuple[slice, ...]:
+    return tuple(slice(*span) for span in box)
 
 
-def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A box [first, last) round a voxel, layer by layer while nine tenths of a layer lie inside."""
-    first, last = seed.copy(), seed + 1
-    sides = list(range(6))
+def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A box [3, 2], first and last + 1, round a voxel, layer by layer while nine tenths of a layer lie inside."""
+    box, sides = np.stack([seed, seed + 1], 1), [[axis, end] for axis in range(3) for end in (0, 1)]
     while sides:
-        for side in rng.permutation(sides):
-            axis, ahead = side % 3, side >= 3
-            edge = last[axis] if ahead else first[axis] - 1
-            if not 0 <= edge < inside.shape[axis]:
-                sides.remove(side)
-                continue
-            layer = list(_cut((first, last)))
+        for axis, end in rng.permutation(sides).tolist():
+            edge = box[axis, end] - 1 + end
+            layer = [*_cut(box)]
             layer[axis] = slice(edge, edge + 1)
-            if np.mean(inside[tuple(layer)]) < 0.9:
-                sides.remove(side)
-            elif ahead:
-                last[axis] += 1
+            if 0 <= edge < inside.shape[axis] and np.mean(inside[tuple(layer)]) >= 0.9:
+                box[axis, end] += 2 * end - 1
             else:
-                first[axis] -= 1
-    return first, last
+                sides.remove([axis, end])
+    return box
 
 
 @jax.jit
