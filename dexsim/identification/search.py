@@ -136,8 +136,8 @@ class Search:
 
     def run(self, latencies: tuple[int, ...]) -> None:
         """Fit once with the given weights, and once with those found."""
-        self._scan_latencies(latencies)
         if self.dead_band is not None:
+            self._scan_latencies(latencies)
             for width in np.linspace(*self.dead_band, _WIDTHS):
                 self._attempt(np.append(self.best.theta[:-1], width), 15)
         for last in (False, True):
@@ -204,7 +204,7 @@ class Search:
         return costs
 
     def _scan_latencies(self, latencies: tuple[int, ...]) -> None:
-        costs = self.costs_by_latency(latencies, 6)
+        costs = self.costs_by_latency(latencies, 6) if len(latencies) > 1 else dict.fromkeys(latencies, 0.0)
         self.latency = min(costs, key=costs.__getitem__)
         self.best = self.best._replace(cost=np.inf)  # that of another latency
 
@@ -212,7 +212,7 @@ class Search:
         """Solve to the end, and take each channel's noise from what the fit leaves."""
         rugged = self.dead_band is not None  # else there is next to nothing to get lost in
         self._attempt(self.best.theta, 30)
-        self._start_over(tries=8 if rugged else 2)
+        self._start_over(tries=8 if rugged else 2 * last)
         if rugged and not last:
             self._explore(rounds=6)
         left = self.residual(*self.best[1:]).reshape(self.measured.shape)
