@@ -30,15 +30,13 @@ def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
     local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
     lever = jnp.asarray(hand.joint_anchor) - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
-    local_position = hand.body_position + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
+    local_position = jnp.asarray(hand.body_position) + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
 
     depth = np.zeros(len(hand.body_parent), int)
     for body, above in enumerate(hand.body_parent):  # which comes before it
         depth[body] = 0 if above < 0 else depth[above] + 1
     roots, *deeper = [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
-    order = list(roots)
-    position: jax.Array = local_position[roots]
-    rotation: jax.Array = local_rotation[roots]
+    order, position, rotation = list(roots), local_position[roots], local_rotation[roots]
     for level in deeper:
         rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
         new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
