@@ -24,8 +24,9 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
 from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, hinge_angles
+from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics
 from dexsim.hand.load import load_hand
+from dexsim.hand.mjcf import hand_poses
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.placement import clearance, palm_height
 
@@ -44,18 +45,12 @@ _SIDEWAYS = 0.01  # m, how far a thumb must be to a side for it to have one
 
 def check_kinematics(hand: Hand) -> str:
     """Link poses against C MuJoCo at random joint angles."""
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    data, random = mujoco.MjData(model), np.random.default_rng(0)
-    palm, bodies = model.body(hand.palm).id, [model.body(name).id for name in hand.body_names]
-    for _ in range(_POSES):
-        angle = random.uniform(hand.joint_lower, hand.joint_upper)
-        data.qpos[:] = hinge_angles(hand, angle)
-        mujoco.mj_kinematics(model, data)
-        frame = data.xmat[palm].reshape(3, 3)
-        place, turn = (data.xpos[bodies] - data.xpos[palm]) @ frame, frame.T @ data.xmat[bodies].reshape(-1, 3, 3)
-        pose = forward_kinematics(hand, angle.astype(np.float32))
-        away = np.linalg.norm(pose.body_position - place, axis=-1)
-        turned = np.linalg.norm(pose.body_rotation - turn, axis=(-2, -1)) / np.sqrt(2)  # small angles
+    angles = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (_POSES, hand.num_joints))
+    poses = jax.vmap(lambda joints: forward_kinematics(hand, joints))(angles.astype(np.float32))
+    positions, rotations = np.asarray(poses.body_position), np.asarray(poses.body_rotation)
+    for drawn, position, rotation in zip(hand_poses(hand, angles), positions, rotations, strict=True):
+        away = np.linalg.norm(position - drawn.body_position, axis=-1)
+        turned = np.linalg.norm(rotation - drawn.body_rotation, axis=(-2, -1)) / np.sqrt(2)  # small angles
         for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):
             if error.max() > limit:
                 name = hand.body_names[int(error.argmax())]
@@ -124,16 +119,14 @@ def check_signs(hand: Hand) -> str:
     its taxels face in the grasp."""
     opened, wrong = _open(hand), []
     grasp = np.asarray(hand.grasp_posture, np.float32) if hand.grasp_posture else opened
+    motion = jax.jit(jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position))
+    jacobian, way = np.array(motion(opened)), np.tile([1.0, 0.0, 0.0], (hand.num_fingers, 1))
+    jacobian[0] = motion(grasp)[0]
+    way[0] = np.asarray(forward_kinematics(hand, grasp).tip_rotation[0]) @ hand.taxel_normal[0].mean(0)
     for finger in range(hand.num_fingers):
-        posture = grasp if finger == 0 else opened
-        jacobian = np.asarray(jax.jacfwd(lambda q, f=finger: forward_kinematics(hand, q).tip_position[f])(posture))
-        way = np.array([1.0, 0.0, 0.0])
-        if finger == 0:
-            frame = np.asarray(forward_kinematics(hand, posture).tip_rotation[finger])
-            way = frame @ hand.taxel_normal[finger].mean(0)
         for joint in flexion_joints(hand, range(finger, finger + 1)):
-            motion = jacobian[:, joint]
-            if motion @ way < -0.2 * np.linalg.norm(motion) * np.linalg.norm(way):
+            step = jacobian[finger, :, joint]
+            if step @ way[finger] < -0.2 * np.linalg.norm(step) * np.linalg.norm(way[finger]):
                 wrong.append(hand.joint_names[joint])
     must = "they must close the finger, toward the palm's normal +x; negate the joint's axis and range"
     return f"positive angles open {', '.join(wrong)}: {must}" if wrong else ""

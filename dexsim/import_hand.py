@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
@@ -106,32 +106,35 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     )
     along, normal = (parse_axis(text) if text else None for text in (arguments.fingers, arguments.normal))
     orient(draft, thumb=arguments.thumb, along=along, normal=normal)
-    print("\n".join(frame_lines(draft)))
+    print("\n".join(draft.findings))
     if not arguments.yes:
         _confirm()
+    said = len(draft.findings)
     fit_links(draft, arguments.torque, arguments.speed)
-    remarks = [
-        f"Imported from {arguments.file.name} by dexsim import-hand.",
-        f"palm frame in that of {draft.links[0].name}: x {_axis(draft.rotation[0])}, z {_axis(draft.rotation[2])}",
-        f"signs: {', '.join(draft.reversed)} turned round" if draft.reversed else "signs: as in the file",
-        *(f"assumed: {text}" for text in draft.assumed),
-    ]
+    remarks = [f"Imported from {arguments.file.name} by dexsim import-hand.", *draft.findings]
+    hand = load_hand(write_hand(draft, name, remarks, folder))
     for gap in _GAPS:
-        gaps = find_grasp(draft, gap)
-        draft.finger_force = force_targets(load_hand(write_hand(draft, name, remarks, folder)))
-        path = write_hand(draft, name, remarks, folder)
+        posture, centre, gaps = find_grasp(hand, gap)
+        force = force_targets(hand, posture)
+        grasp: dict[str, Any] = {"posture": posture, "centre": centre, "finger_force": force}
+        path = write_hand(draft, name, remarks, folder, grasp)
         checks, passed = report(path)
         if not any("free of overlap" in line for line in checks):
             break
-    print("\n".join([*fit_lines(draft, gaps, gap), *(f"assumed      {text}" for text in draft.assumed), *checks]))
+    held = [
+        f"force        targets of {force[0]:.1f} to {force[1]:.1f} N a finger: what the thumb can oppose",
+        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in centre)} mm, {np.sum(is_near(gaps, gap))} of "
+        f"{len(gaps)} fingertips near it, the farthest {1e3 * gaps.max():.0f} mm away",
+    ]
+    print("\n".join([*fit_lines(draft), *held, *draft.findings[said:], *checks]))
     return path, passed
 
 
-def force_targets(hand: Hand) -> tuple[float, float]:
-    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture, shared
-    by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand, or what
-    carries an object."""
-    thumb, *others = fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))
+def force_targets(hand: Hand, posture: np.ndarray) -> tuple[float, float]:
+    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture [J],
+    shared by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand,
+    or what carries an object."""
+    thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
     highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
     return min(max(highest / 4, _CARRYING), highest), highest
 
@@ -153,31 +156,6 @@ def parse_axis(text: str) -> np.ndarray:
     raise ConfigError(f"axis {text!r}: expected +x, -y, z or three numbers as 0,0.5,1")
 
 
-def frame_lines(draft: Draft) -> list[str]:
-    """What was found of palm, fingers and signs."""
-    links, motors = draft.links, len(draft.motors)
-    fingers = ", ".join(f"{name} ({links[chain[-1]].name})" for name, chain in draft.fingers.items())
-    along, facing = _axis(draft.rotation[2]), _axis(draft.rotation[0])
-    lines = [
-        f"{draft.name}: {draft.kind}, {motors} motors, {len(links) - 1 - motors} joints that follow them",
-        f"palm         body {links[0].name}",
-        f"fingers      {fingers}",
-        f"palm frame   fingers along {along} of the file's body, palm facing {facing}; a {draft.side} hand",
-    ]
-    if draft.frozen:
-        lines.append(f"frozen at 0  {', '.join(draft.frozen)}: above the palm, or by --freeze")
-    if draft.reversed:
-        lines.append(f"reversed     {', '.join(draft.reversed)}: positive opens in the file, closes here")
-    return lines + [f"note         {note}" for note in draft.notes]
-
-
-def _axis(vector: np.ndarray) -> str:
-    at = int(np.argmax(np.abs(vector)))
-    if abs(vector[at]) > 0.9999:
-        return f"{'-' if vector[at] < 0 else '+'}{'xyz'[at]}"
-    return ",".join(f"{x:.3f}" for x in vector)
-
-
 def _confirm() -> None:
     """Ask whether the palm frame is right.
 
@@ -191,7 +169,7 @@ def _confirm() -> None:
 
 
 def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
-    """Limits, masses and capsules of all links, and the palm's box; what had to be assumed goes to `draft.assumed`.
+    """Limits, masses and capsules of all links, and the palm's box.
 
     Args:
       torque, speed: of all motors, Nm and rad/s; 0 for the file's.
@@ -215,7 +193,7 @@ def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
         roots = np.array([link.anchor for link in links if link.parent == 0])
         box = trimesh.creation.box(np.ptp(roots, axis=0) + 0.015)
         links[0].surface = box.apply_translation((roots.max(0) + roots.min(0)) / 2)
-        draft.assumed.append("palm: no mesh, a box of 15 mm round the fingers' roots")
+        draft.findings.append("assumed      palm: no mesh, a box of 15 mm round the fingers' roots")
     tips = {chain[-1] for chain in draft.fingers.values()}
     for at, link in enumerate(links[1:], 1):
         if at in tips:
@@ -236,7 +214,9 @@ def _assume_limits(draft: Draft, what: str, given: float, span: tuple[float, flo
             setattr(motor, what, best)
     if odd and not given:
         wrong = ", ".join(sorted({f"{value:g}" for value in odd.values() if value})) or "nothing"
-        draft.assumed.append(f"{what} {best:g} {unit} at {len(odd)} motors: the file says {wrong}; --{what} gives it")
+        draft.findings.append(
+            f"assumed      {what} {best:g} {unit} at {len(odd)} motors: the file says {wrong}; --{what} gives it"
+        )
 
 
 def _assume_masses(draft: Draft) -> None:
@@ -250,7 +230,7 @@ def _assume_masses(draft: Draft) -> None:
             names.append(link.name)
         link.mass, link.inertia = max(link.mass, _LEAST_MASS), link.inertia + 1e-9 * np.eye(3)
     if names:
-        draft.assumed.append(f"mass by volume: {', '.join(names)}")
+        draft.findings.append(f"assumed      mass by volume: {', '.join(names)}")
 
 
 def _along(links: Sequence[Link], at: int) -> np.ndarray:
@@ -265,7 +245,7 @@ def _fit_pad(draft: Draft, at: int) -> Capsule:
     """The capsule of a fingertip, without the rubber, which the environment adds, and not back to the hinge."""
     link, along = draft.links[at], _along(draft.links, at)
     if link.surface is None:
-        draft.assumed.append(f"{link.name}: no mesh, a fingertip of 25 mm")
+        draft.findings.append(f"assumed      {link.name}: no mesh, a fingertip of 25 mm")
         ends = np.stack([link.anchor + 0.008 * along, link.anchor + 0.02 * along])
         return Capsule(ends=ends, radius=0.005)
     capsule = fit_capsule(link.surface, along)
@@ -276,8 +256,8 @@ def _fit_pad(draft: Draft, at: int) -> Capsule:
     return capsule
 
 
-def fit_lines(draft: Draft, gaps: np.ndarray, gap: float) -> list[str]:
-    """A line for each capsule, the palm and the grasp, whose fingertips are `gaps` [F] m from the ball."""
+def fit_lines(draft: Draft) -> list[str]:
+    """A line for each capsule and the palm."""
     lines = ["capsule                 of joint                radius, fit's mean and largest error [mm]"]
     for link in draft.links:
         if link.capsule:
@@ -285,14 +265,10 @@ def fit_lines(draft: Draft, gaps: np.ndarray, gap: float) -> list[str]:
             lines.append(f"  {link.name[:20]:21} {link.joint[:20]:21} {radius:8.1f} {mean:8.1f} {most:8.1f}")
     assert draft.palm is not None, "fitted before"
     sides, face = " x ".join(f"{2e3 * x:.0f}" for x in draft.palm.half), draft.palm.centre[0] + draft.palm.half[0]
-    low, high = draft.finger_force
+    beyond = f"{1e3 * draft.palm.largest_error:.0f} mm"
     return [
         *lines,
-        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches "
-        f"{1e3 * draft.palm.largest_error:.0f} mm beyond it",
-        f"force        targets of {low:.1f} to {high:.1f} N a finger: what the thumb can oppose",
-        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in draft.centre)} mm, "
-        f"{np.sum(is_near(gaps, gap))} of {len(gaps)} fingertips near it, the farthest {1e3 * gaps.max():.0f} mm away",
+        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond} beyond it",
     ]
 
 

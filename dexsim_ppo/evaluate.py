@@ -7,7 +7,6 @@ start states are drawn by the seed; training had others. A hand that does nothin
 achieves, too, is no achievement.
 """
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -20,12 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from rich.console import Console
+from rich.progress import track
 
 from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, override, setting
 from dexsim.core.errors import ConfigError
-from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
 from dexsim_ppo.learner.networks import zero_carry
 from dexsim_ppo.learner.types import Environment
@@ -59,12 +59,16 @@ class Evaluator:
         if (count, seed) not in self._plans:  # kept, since a run selects its best policy on the same ones
             self._plans[count, seed] = self.protocol.evaluation_plan(count, seed)
         plan = self._plans[count, seed]
-        with progress(label, count, "episodes") if label else contextlib.nullcontext() as show:
-            for i in range(0, count, self.chunk):
-                part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
-                parts.append(jax.device_get(self._run(params, part, idle)))
-                if show:
-                    show(i + self.chunk)
+        bar = track(
+            range(0, count, self.chunk),
+            description=f"{label} ({count} episodes)",
+            console=Console(stderr=True),
+            transient=True,
+            disable=not label,
+        )
+        for i in bar:
+            part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
+            parts.append(jax.device_get(self._run(params, part, idle)))
         # Episodes are the last axis of all that is measured.
         metrics, over = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
         make_report = summarize_totals if self.totals else summarize

@@ -24,12 +24,14 @@ from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
+from dexsim.core.install import require
 from dexsim.datasets.episodes import Episodes, write_episodes
 from dexsim.datasets.lerobot import check_lerobot, write_lerobot
-from dexsim.datasets.rerun import check_rerun, show_rerun
+from dexsim.datasets.rerun import show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
-from dexsim.render.picture import draw_scene, hand_poses
+from dexsim.hand.mjcf import hand_poses
+from dexsim.render.picture import draw_scene
 from dexsim.render.render import camera_of
 from dexsim.render.snapshot import Snapshot
 from dexsim_ppo.policy import Policy, act, load_policy
@@ -119,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.lerobot:
         check_lerobot(arguments.lerobot)
     if arguments.rrd:
-        check_rerun()
+        require("rerun", "rerun", "a recording for the rerun viewer")
         cli.check_writable(arguments.rrd)
     if arguments.npz:
         cli.check_writable(arguments.npz)

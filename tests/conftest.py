@@ -20,7 +20,8 @@ import jaxlib
 
 ON_GPU = os.environ.get("DEXSIM_TEST_GPU", "") not in ("", "0")
 
-# Through the environment and before JAX is imported: the programs that tests start inherit it.
+# Through the environment and before JAX and NumPy are imported: the programs that tests start inherit it.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # Two threads of one decomposition wait for a core that another process has.
 if not ON_GPU:
     os.environ["JAX_PLATFORMS"] = "cpu"
 _cache = Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim")

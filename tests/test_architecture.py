@@ -61,19 +61,19 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 15_880,  # goal: 12,500
-    "dexsim/core": 890,  # goal: 900
-    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_510,  # goal: 1,900
-    "dexsim/hand dexsim/objects": 2_860,  # goal: 1,900
+    "dexsim": 15_510,  # goal: 12,500
+    "dexsim/core": 860,  # goal: 900
+    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_450,  # goal: 1,900
+    "dexsim/hand dexsim/objects": 2_820,  # goal: 1,900
     "dexsim/physics": 2_450,  # goal: 2,200, and 1,300 of CUDA
     "dexsim/env dexsim/tasks": 2_680,  # goal, with the roots: 3,200
-    ROOTS: 1_670,
-    "dexsim/calibration dexsim/identification": 1_540,  # goal: 1,500
-    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_290,  # goal: 1,900
+    ROOTS: 1_640,
+    "dexsim/calibration dexsim/identification": 1_490,  # goal: 1,500
+    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_150,  # goal: 1,900
     "dexsim_ppo": 4_100,  # goal: 4,000
-    "dexsim_real": 9_350,  # goal: 6,500
+    "dexsim_real": 8_910,  # goal: 6,500
     "benchmarks": 2_300,
-    "tests": 22_340,  # goal: 18,000
+    "tests": 21_700,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

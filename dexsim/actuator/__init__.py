@@ -1,1 +1,1 @@
-"""One joint's drive: torque, gear play, motor current."""
+"""One joint's drive: torque, dead-band, friction, latency."""

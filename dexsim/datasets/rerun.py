@@ -2,30 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
-from dexsim.core.install import install_line
+from dexsim.core.install import require
 from dexsim.hand.description import Hand
 from dexsim.render.panel import taxel_image
 
 Series = Mapping[str, tuple[Sequence[str], np.ndarray]]
 """Values [T, n] and the names of their columns, by entity."""
-
-
-def check_rerun() -> Any:
-    """The module `rerun`.
-
-    Raises:
-      DexsimError: it is not installed.
-    """
-    try:
-        import rerun
-    except ImportError:
-        raise DexsimError(f"the rerun viewer is not installed: {install_line('rerun')}") from None
-    return rerun
 
 
 def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path) -> None:
@@ -35,7 +20,9 @@ def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.nda
       DexsimError: rerun is not installed.
       OSError: the file cannot be written.
     """
-    rerun = check_rerun()
+    require("rerun", "rerun", "a recording for the rerun viewer")
+    import rerun
+
     recording = rerun.RecordingStream("dexsim")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()  # Its error names the file; rerun's does not.

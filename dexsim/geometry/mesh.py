@@ -72,7 +72,9 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
         closed = (_shell if repair == "shell" else _hull)(mesh)
         mesh, given = make_mesh(f"{name} after repair", *_merge(*closed, _SAME * size)), mesh
         _check_closed(mesh, size)
-        print(f"{error}; its {repair} is {1e3 * _deviation(given, mesh):.2g} mm away", file=sys.stderr)
+        a, b = _points_on(given), _points_on(mesh)
+        away = 1e3 * max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
+        print(f"{error}; its {repair} is {away:.2g} mm away", file=sys.stderr)
     return mesh
 
 
@@ -150,11 +152,10 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
 
 def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Random points [count, 3] m, uniform by area, with their face normals [count, 3]."""
-    share = np.cumsum(mesh.area_faces)
-    face = np.searchsorted(share, rng.uniform(0, share[-1], count)).clip(0, len(share) - 1)
-    u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
-    weight = np.stack([1 - u, u * (1 - v), u * v], -1)
-    return np.einsum("pk,pkd->pd", weight, mesh.triangles[face]), np.asarray(mesh.face_normals)[face]
+    import trimesh
+
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=rng)
+    return np.asarray(points), np.asarray(mesh.face_normals)[face]
 
 
 def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
@@ -266,9 +267,3 @@ def _points_on(mesh: Trimesh) -> np.ndarray:
     """Random points on a surface, and its corners."""
     points, _ = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
     return np.concatenate([points, mesh.vertices])
-
-
-def _deviation(one: Trimesh, other: Trimesh) -> float:
-    """The largest distance m of a point of either surface from the other one, between samples."""
-    a, b = _points_on(one), _points_on(other)
-    return float(max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max()))

@@ -38,21 +38,30 @@ def orient(draft: Draft, *, thumb: str = "", along: np.ndarray | None = None, no
             "hand, --freeze JOINT fixes a hinge that is no finger's"
         )
     first = chains.pop(_find_thumb(draft, chains, thumb))
-    draft.rotation = _find_frame(links, chains, along, normal)
+    rotation = _find_frame(links, chains, along, normal)
     for link in links:
-        _turn(link, draft.rotation)
+        _turn(link, rotation)
     chains.sort(key=lambda chain: _aside(links, chain))
     thumb_side = _aside(links, first) - np.mean([_aside(links, chain) for chain in chains])
     if thumb_side > 0:
         chains.reverse()  # from the thumb's side on
     draft.fingers = {"thumb": first, **dict(zip(_NAMES, chains, strict=False))}
-    draft.side = "left" if thumb_side < 0 else "right"
-    _close_positive(draft)
-    other = "right" if draft.side == "left" else "left"
+    draft.side, other = ("left", "right") if thumb_side < 0 else ("right", "left")
+    wrong = _close_positive(draft)
+    fingers = ", ".join(f"{name} ({links[chain[-1]].name})" for name, chain in draft.fingers.items())
+    draft.findings += [
+        f"{draft.name}: {len(draft.motors)} motors, {len(links) - 1 - len(draft.motors)} joints that follow them",
+        f"palm         body {links[0].name}",
+        f"fingers      {fingers}",
+        f"palm frame   fingers along {_axis(rotation[2])} of the file's body, palm facing {_axis(rotation[0])}; "
+        f"a {draft.side} hand",
+    ]
+    if wrong:
+        draft.findings.append(f"reversed     {', '.join(wrong)}: positive opens in the file, closes here")
     names = " ".join([draft.name, *(link.name for link in links)]).lower()
     if other in names and draft.side not in names:
-        draft.notes.append(
-            f"the file's names say {other}, the thumb is where a {draft.side} hand has it: check the palm frame"
+        draft.findings.append(
+            f"note         the file's names say {other}, the thumb is where a {draft.side} hand has it: check the frame"
         )
 
 
@@ -110,9 +119,8 @@ def _find_thumb(draft: Draft, chains: list[list[int]], given: str) -> int:
         width = np.linalg.norm(roots[rest] - roots[rest].mean(0), axis=1).mean() + 0.02
         scores.append(alike[np.ix_(rest, rest)].mean() - alike[index, rest].mean() + 0.3 * apart / width)
     best = int(np.argmax(scores))
-    draft.notes.append(
-        f"no link is named thumb: taken for it is {links[chains[best][-1]].name}; --thumb NAME changes it"
-    )
+    taken = links[chains[best][-1]].name
+    draft.findings.append(f"note         no link is named thumb: taken for it is {taken}; --thumb NAME changes it")
     return best
 
 
@@ -159,9 +167,9 @@ def _turn(link: Link, rotation: np.ndarray) -> None:
         link.surface.vertices = np.asarray(link.surface.vertices) @ rotation.T
 
 
-def _close_positive(draft: Draft) -> None:
-    """Turn the sign of joints that open with positive angles: of fingers, those that flex and take the tip away from
-    the palm's normal; of the thumb, those that flex and bend farther to the negative side."""
+def _close_positive(draft: Draft) -> list[str]:
+    """Turn the sign of joints that open with positive angles, and name them: of fingers, those that flex and take the
+    tip away from the palm's normal; of the thumb, those that flex and bend farther to the negative side."""
     links, wrong = draft.links, set()
     for name, chain in draft.fingers.items():
         tip = tip_of(links, chain)
@@ -174,7 +182,14 @@ def _close_positive(draft: Draft) -> None:
         link.axis, link.ratio, link.offset = sign * link.axis, sign * leads * link.ratio, sign * link.offset
         if sign < 0:
             link.low, link.high = -link.high, -link.low
-    draft.reversed = tuple(sorted(wrong))
+    return sorted(wrong)
+
+
+def _axis(vector: np.ndarray) -> str:
+    at = int(np.argmax(np.abs(vector)))
+    if abs(vector[at]) > 0.9999:
+        return f"{'-' if vector[at] < 0 else '+'}{'xyz'[at]}"
+    return ",".join(f"{x:.3f}" for x in vector)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import binned_statistic_2d
 
 _SAMPLES = 600
 _CELL = 5e-3  # m, of the grid on which a palm's face is measured
@@ -53,11 +54,9 @@ def fit_palm(surface: Any) -> PalmBox:
     """The box of a palm. Its face is where most of the front is: mounts of thumb and fingers stand out of it."""
     points = _sample(surface, 40 * _SAMPLES)
     low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
-    cells = np.floor((points[:, 1:] - low[1:]) / _CELL).astype(int)
-    front: dict[tuple[int, int], float] = {}
-    for (row, column), x in zip(cells.tolist(), points[:, 0].tolist(), strict=True):
-        front[row, column] = max(x, front.get((row, column), -np.inf))
-    high[0] = np.percentile(list(front.values()), 70)
+    bins = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low[1:], high[1:], strict=True)]
+    front = binned_statistic_2d(points[:, 1], points[:, 2], points[:, 0], "max", bins).statistic
+    high[0] = np.nanpercentile(front, 70)
     half = np.maximum((high - low) / 2, 2e-3)
     beyond = np.maximum(low - points.min(0), points.max(0) - high).max()
     return PalmBox(centre=(low + high) / 2, half=half, largest_error=float(beyond))

@@ -4,7 +4,7 @@ Every body is drawn along the palm frame, with its origin on its hinge. So posit
 palm frame, and no body has a rotation of its own.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,13 @@ _GRID = (6, 8)  # columns and rows of taxels, over the front two thirds of a pad
 _PITCH = 0.0035  # m, at most
 
 
-def write_hand(draft: Draft, name: str, remarks: Iterable[str], folder: Path) -> Path:
+def write_hand(
+    draft: Draft, name: str, remarks: Iterable[str], folder: Path, grasp: Mapping[str, Iterable[float]] | None = None
+) -> Path:
     """Write NAME.xml and NAME.toml into the folder, with remarks as their first lines. Returns the TOML's path.
+
+    Args:
+      grasp: entries of the TOML's `[grasp]`; None for none.
 
     Raises:
       OSError: a file cannot be written.
@@ -33,7 +38,7 @@ def write_hand(draft: Draft, name: str, remarks: Iterable[str], folder: Path) ->
     model = _mjcf(draft, name).to_xml().replace(">\n", f">\n  <!--\n{comment}  -->\n", 1)
     write_atomic(folder / f"{name}.xml", [model.encode()])
     path = folder / f"{name}.toml"
-    text = "\n".join([*(f"# {line}" for line in remarks), *_toml(draft, name)])
+    text = "\n".join([*(f"# {line}" for line in remarks), *_toml(draft, name, grasp or {})])
     write_atomic(path, [f"{text}\n".encode()])
     return path
 
@@ -115,7 +120,7 @@ def _add_capsule(body: Any, link: Link, tip: str) -> None:
         body.add_site(name=f"{tip}_tip", pos=end - link.anchor, size=[0.002, 0, 0], group=4)
 
 
-def _toml(draft: Draft, name: str) -> list[str]:
+def _toml(draft: Draft, name: str, grasp: Mapping[str, Iterable[float]]) -> list[str]:
     links, motors = draft.links, draft.motors
     pads = [capsule for chain in draft.fingers.values() if (capsule := links[chain[-1]].capsule)]
     across = min(_PITCH, min(pad.radius for pad in pads) * np.pi * 2 / 3 / (_GRID[0] - 1))
@@ -132,9 +137,7 @@ def _toml(draft: Draft, name: str) -> list[str]:
         f"taxel_grid = {list(_GRID)}",
         f"taxel_pitch = {_row((across, along))}",
         "\n[grasp]",
-        f"posture = {_row(draft.posture[motor.joint] for motor in motors)}",
-        f"centre = {_row(draft.centre)}",
-        f"finger_force = {_row(draft.finger_force)}",
+        *(f"{name} = {_row(values)}" for name, values in grasp.items()),
     ]
     for finger, chain in draft.fingers.items():
         last = links[chain[-1]]

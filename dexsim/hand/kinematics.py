@@ -30,9 +30,12 @@ def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
     local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
     lever = jnp.asarray(hand.joint_anchor) - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
-    local_position = hand.body_position + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
+    local_position = jnp.asarray(hand.body_position) + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
 
-    roots, *deeper = _levels(hand.body_parent)
+    depth = np.zeros(len(hand.body_parent), int)
+    for body, above in enumerate(hand.body_parent):  # which comes before it
+        depth[body] = 0 if above < 0 else depth[above] + 1
+    roots, *deeper = [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
     order, position, rotation = list(roots), local_position[roots], local_rotation[roots]
     for level in deeper:
         rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
@@ -65,14 +68,6 @@ def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
     return rotations.rotate(pose.tip_rotation[:, None], jnp.asarray(hand.taxel_normal))
 
 
-def _levels(parent: np.ndarray) -> list[np.ndarray]:
-    """Body indices grouped by depth; every body follows its parent."""
-    depth = np.zeros(len(parent), int)
-    for body, above in enumerate(parent):
-        depth[body] = 0 if above < 0 else depth[above] + 1
-    return [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
-
-
 def finger_bodies(hand: Hand, finger: int) -> list[int]:
     """Bodies from a fingertip's to the palm's."""
     bodies = [int(hand.tip_body[finger])]
@@ -84,7 +79,10 @@ def finger_bodies(hand: Hand, finger: int) -> list[int]:
 def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
     """Joint indices of these fingers from their root joint to the tip, but those that swing the finger sideways: hinges
     whose axes are not parallel to the root joint's."""
-    frames, joints = _drawn_frames(hand), set[int]()
+    frames, joints = np.array(hand.body_rotation), set[int]()
+    for body, above in enumerate(hand.body_parent):  # in the palm's frame, with every hinge as drawn
+        if above >= 0:
+            frames[body] = frames[above] @ frames[body]
     for finger in fingers:
         chain = finger_bodies(hand, finger)
         root = [place for place, body in enumerate(chain) if hand.body_joint[body] == hand.root_joint[finger]]
@@ -93,15 +91,6 @@ def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
             if hand.body_joint[body] >= 0 and cosine > 0.7:
                 joints.add(int(hand.body_joint[body]))
     return np.array(sorted(joints), int)
-
-
-def _drawn_frames(hand: Hand) -> np.ndarray:
-    """Rotations [B, 3, 3] of the bodies in the palm's frame, with every hinge as drawn."""
-    frames = np.array(hand.body_rotation)
-    for body, above in enumerate(hand.body_parent):
-        if above >= 0:
-            frames[body] = frames[above] @ frames[body]
-    return frames
 
 
 def fingertip_strength(hand: Hand, joint_position: Array) -> np.ndarray:

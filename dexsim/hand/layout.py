@@ -1,6 +1,6 @@
-"""Taxel layouts for any hand or pad: lattices on primitives, and the layout file.
+"""Taxel layouts for any hand or pad: lattices on capsules, and the layout file.
 
-    tip = lay_taxels("cylinder", (10, 12), pitch=0.0022, radius=0.008, position=(0, 0, 0.02))
+    tip = lay_taxels((10, 12), pitch=0.0022, radius=0.008, half_length=0.02, position=(0, 0, 0.02))
     write_layout("taxels.csv", {"index": tip, "thumb": other}, (10, 12))
 
 The file is the one that a hand's TOML names as `taxels`; `finger` in it is the link that carries the taxels.
@@ -21,7 +21,6 @@ import numpy as np
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import write_atomic
 
-SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _SMALLEST, _LARGEST = 1e-12, 1e-2  # m^2, area of a taxel: square millimetres are refused
 MOST = 1000
 """Columns or rows of taxels, at most."""
@@ -29,61 +28,50 @@ COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
 
 def lay_taxels(
-    surface: str,
     grid: tuple[int, int],
     *,
     pitch: float | tuple[float, float],
-    radius: float = 0.0,
+    radius: float,
     half_length: float = 0.0,
     kind: str = "rect",
     position: Any = (0.0, 0.0, 0.0),
     rotation: Any = None,
 ) -> np.ndarray:
-    """Taxels [N, 7] of a lattice that is laid on a primitive without stretching it along the rows.
+    """Taxels [N, 7] of a lattice that is laid on a capsule without stretching it along the rows.
 
-    plane: z = 0, facing +z, columns along x, rows along y. cylinder (radius, axis z): columns round the axis from +x,
-    rows along z. capsule (radius, half_length of the straight part): like a cylinder, rows beyond the straight part go
-    over the caps. sphere (radius): columns along the equator from +x, rows along the meridian. Where meridians draw
-    together, areas shrink with them.
+    Columns run round the axis, z, from +x; rows along z, and beyond the straight part over the caps. Where meridians
+    draw together, areas shrink with them. A capsule without a straight part is a sphere.
 
     Args:
-      surface: one of SURFACES.
       grid: columns, rows.
       pitch: distance of neighbours; for "rect" also (across, along).
+      radius, half_length: m, of the capsule and its straight part.
       kind: "rect", or "hex" with every other row shifted by half a pitch and rows sqrt(3)/2 pitches apart.
-      position, rotation: [3] and [3, 3], where the primitive is in the link's frame.
+      position, rotation: [3] and [3, 3], where the capsule is in the link's frame.
 
     Raises:
-      ConfigError: an unknown kind or surface, or a lattice that does not fit on the surface.
+      ConfigError: an unknown kind, or a lattice that does not fit on the capsule.
     """
-    for name, known in ((kind, ("rect", "hex")), (surface, SURFACES)):
-        if name not in known:
-            raise ConfigError(f"lattice {name!r}: choose from {', '.join(known)}")
+    if kind not in ("rect", "hex"):
+        raise ConfigError(f"lattice {kind!r}: choose from rect, hex")
     across, along = (pitch, pitch) if isinstance(pitch, (int, float)) else pitch
     along = across * np.sqrt(3) / 2 if kind == "hex" else along
     column, row = (x.ravel() for x in np.meshgrid(*map(np.arange, grid), indexing="ij"))
     shift = 0.25 * np.where(row % 2, 1, -1) if kind == "hex" else 0.0
     # Arc lengths from the lattice's middle.
     u, v = across * (column - (grid[0] - 1) / 2 + shift), along * (row - (grid[1] - 1) / 2)
-    zero, cell = 0 * u, across * along
-    if surface == "plane":
-        place, normal, area = np.stack([u, v, zero], -1), np.stack([zero, zero, zero + 1], -1), zero + cell
-    else:
-        if np.ptp(u) >= 2 * np.pi * radius:
-            raise ConfigError(
-                f"surface {surface!r}: the lattice is {np.ptp(u):.4g} m wide and laps itself on a girth of "
-                f"{2 * np.pi * radius:.4g} m"
-            )
-        straight = {"cylinder": np.inf, "capsule": half_length, "sphere": 0.0}[surface]
-        over = np.sign(v) * np.maximum(np.abs(v) - straight, 0.0)
-        angle, polar = u / radius, over / radius
-        if np.any(np.abs(polar) >= np.pi / 2 - 1e-6):
-            reach = np.abs(v).max()
-            raise ConfigError(f"surface {surface!r}: rows reach {reach:.4g} m from the middle, beyond the pole")
-        normal = np.stack([np.cos(polar) * np.cos(angle), np.cos(polar) * np.sin(angle), np.sin(polar)], -1)
-        place, area = radius * normal + np.stack([zero, zero, v - over], -1), cell * np.cos(polar)
+    girth = 2 * np.pi * radius
+    if np.ptp(u) >= girth:
+        raise ConfigError(f"the lattice is {np.ptp(u):.4g} m wide and laps itself on a girth of {girth:.4g} m")
+    over = np.sign(v) * np.maximum(np.abs(v) - half_length, 0.0)
+    angle, polar = u / radius, over / radius
+    if np.any(np.abs(polar) >= np.pi / 2 - 1e-6):
+        raise ConfigError(f"rows reach {np.abs(v).max():.4g} m from the lattice's middle, beyond the pole")
+    normal = np.stack([np.cos(polar) * np.cos(angle), np.cos(polar) * np.sin(angle), np.sin(polar)], -1)
+    place = radius * normal + np.outer(v - over, [0, 0, 1])
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return np.concatenate([place @ turn.T + np.asarray(position, float), normal @ turn.T, area[:, None]], -1)
+    area = across * along * np.cos(polar)
+    return np.column_stack([place @ turn.T + np.asarray(position, float), normal @ turn.T, area])
 
 
 def write_layout(path: str | Path, taxels: Mapping[str, np.ndarray], grid: tuple[int, int]) -> Path:

@@ -7,7 +7,6 @@ import hashlib
 import re
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -109,28 +108,13 @@ def shipped_name(path: Path) -> str:
 
 
 def read_mjcf(path: Path) -> bytes:
-    """A file's content; of an MJCF that includes others, with their content in its place."""
+    """A file's content; an MJCF that includes others as MuJoCo writes it, with their content in their place."""
     data = path.read_bytes()
     if path.suffix != ".xml" or b"<include" not in data:
         return data
-    model = ElementTree.fromstring(data)
-    _paste_includes(model, path.parent, path.parent)
-    return ElementTree.tostring(model)
+    import mujoco
 
-
-def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
-    """MuJoCo looks beside the model first, in `top`, then beside the file that includes, in `folder`."""
-    children = []
-    for child in list(element):
-        if child.tag != "include":
-            _paste_includes(child, top, folder)
-            children.append(child)
-            continue
-        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
-        included = ElementTree.parse(file).getroot()
-        _paste_includes(included, top, file.parent)
-        children += included
-    element[:] = children
+    return mujoco.MjSpec.from_file(str(path)).to_xml().encode()
 
 
 def digest_of(*files: Path) -> str:
@@ -338,15 +322,13 @@ def _find_tips(model: Any, table: HandFile, row: dict[int, int]) -> list[int]:
     tips: list[int] = []
     for finger in table.fingers:
         tip, root = model.site(finger.tip).id, model.joint(finger.root_joint).id
-        body = int(model.site_bodyid[tip])
+        body, name = int(model.site_bodyid[tip]), f"tip {finger.tip!r}"
         if body not in row:
-            raise ConfigError(f"tip {finger.tip!r} is on no body of {table.palm!r}")
+            raise ConfigError(f"{name} is on no body of {table.palm!r}")
         if body in model.site_bodyid[tips]:  # the physics gives the force on a link, not where on it
-            raise ConfigError(f"tip {finger.tip!r} is on {model.body(body).name!r}, as another finger's tip")
-        if finger.root_joint not in table.joints:
-            raise ConfigError(f"root_joint {finger.root_joint!r} is not among joints")
-        if not is_below(model.body_parentid, body, int(model.jnt_bodyid[root])):
-            raise ConfigError(f"root_joint {finger.root_joint!r} does not move the tip {finger.tip!r}")
+            raise ConfigError(f"{name} is on {model.body(body).name!r}, as another finger's tip")
+        if finger.root_joint not in table.joints or not is_below(model.body_parentid, body, model.jnt_bodyid[root]):
+            raise ConfigError(f"root_joint {finger.root_joint!r} is not among joints, or does not move {name}")
         tips.append(tip)
     return tips
 
@@ -356,32 +338,25 @@ def _lay_taxels(table: HandFile, geoms: tuple[Geom, ...], tip_body: np.ndarray) 
     taxels = []
     for finger, body in zip(table.fingers, tip_body, strict=True):
         with naming_file(f"finger {finger.name!r}"):
-            pads = [geom for geom in geoms if geom.name == finger.pad and geom.body == body]
-            if len(pads) != 1 or pads[0].kind not in ("capsule", "sphere"):
+            pad = next((geom for geom in geoms if geom.name == finger.pad and geom.body == body), None)
+            if pad is None or pad.kind not in ("capsule", "sphere"):
                 raise ConfigError(f"pad = {finger.pad!r}: expected a capsule or sphere of the tip's body")
-            (pad,) = pads
+            along = np.asarray(pad.rotation[:, 2], float)
+            facing = np.asarray(finger.facing or along, float)
+            across = facing - np.dot(facing, along) * along
+            if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(facing):
+                raise ConfigError(f"facing = {finger.facing}: expected a direction across the pad {pad.name!r}")
+            across /= np.linalg.norm(across)
             rows = lay_taxels(
-                pad.kind,
                 table.taxel_grid,
                 pitch=table.taxel_pitch or 0.0,
                 radius=float(pad.size[0]),
                 half_length=float(pad.size[1]),
                 position=pad.position,
-                rotation=_pad_frame(pad, finger.facing),
+                rotation=np.stack([across, np.cross(along, across), along], -1),
             )
         taxels.append(rows)
     return np.asarray(taxels, np.float32)
-
-
-def _pad_frame(pad: Geom, facing: tuple[float, float, float] | None) -> np.ndarray:
-    """The rotation [3, 3] that takes a primitive's axis, z, to the pad's, and x to the direction that it faces."""
-    along = np.asarray(pad.rotation[:, 2], float)
-    direction = np.asarray(facing or along, float)
-    across = direction - np.dot(direction, along) * along
-    if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(direction):
-        raise ConfigError(f"facing = {facing}: expected a direction across the pad {pad.name!r}")
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(along, across), along], -1)
 
 
 def _f32(values) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""A hand's MJCF as an editable MuJoCo specification, placed as the library reckons: in the palm frame."""
+"""A hand in MuJoCo: its MJCF as an editable specification, and poses of its parts, both in the palm frame."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -52,3 +55,37 @@ def _poses(model: mujoco.MjModel, *names: str) -> list[np.ndarray]:
         pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
         poses.append(pose)
     return poses
+
+
+class Pose(NamedTuple):
+    """Where the hand's parts are, NumPy."""
+
+    body_position: np.ndarray  # [B, 3] m
+    body_rotation: np.ndarray  # [B, 3, 3]
+    taxel_position: np.ndarray  # [F, N, 3] m
+    taxel_normal: np.ndarray  # [F, N, 3]
+
+
+def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
+    """Poses of T frames from joint angles [T, J] rad, by MuJoCo."""
+    model, data = _plant(hand)
+    bodies = [model.body(name).id for name in hand.body_names]
+    moving = np.flatnonzero(hand.body_joint >= 0)
+    hinges = model.jnt_qposadr[model.body_jntadr[np.array(bodies)[moving]]]
+    poses = []
+    for angles in np.asarray(joint_position, float):
+        data.qpos[hinges] = angles[hand.body_joint[moving]] * hand.body_ratio[moving] + hand.body_offset[moving]
+        mujoco.mj_kinematics(model, data)
+        palm = data.xmat[bodies[0]].reshape(3, 3)
+        position = (data.xpos[bodies] - data.xpos[bodies[0]]) @ palm
+        rotation = palm.T @ data.xmat[bodies].reshape(-1, 3, 3)
+        tips = rotation[hand.tip_body].swapaxes(-1, -2)
+        taxels = position[hand.tip_body, None] + hand.taxel_position @ tips
+        poses.append(Pose(*(x.astype(np.float32) for x in (position, rotation, taxels, hand.taxel_normal @ tips))))
+    return poses
+
+
+@lru_cache(maxsize=4)
+def _plant(hand: Hand) -> tuple[Any, Any]:
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    return model, mujoco.MjData(model)

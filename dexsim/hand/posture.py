@@ -1,17 +1,16 @@
 """A first grasp: where a ball lies before the palm, and the joint angles that close fingers and thumb round it.
 
-Shapes: N postures tried at once, L links, C capsules of a chain. Units: m, rad, in the palm frame.
+Shapes: N postures tried at once, C capsules of a finger. Units: m, rad, in the palm frame.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from dexsim.hand.anatomy import flexion_links
+from dexsim.hand.description import Hand
 from dexsim.hand.fit import segment_distance
-from dexsim.hand.vendor import Draft, Link
+from dexsim.hand.kinematics import finger_bodies, flexion_joints
+from dexsim.hand.mjcf import hand_poses
 
 BALL = 0.028  # m, radius: the middle of the spheres that grasps are trained with
 _SHARES = (1.0, 0.9, 0.6, 0.6, 0.6)  # of the bend, from a finger's first flexing hinge on
@@ -22,26 +21,24 @@ _STEP = 8e-3  # m, between places of the ball
 _NEAR = 0.02  # m, a tip farther from the ball than this and the gap does not hold it
 
 
-def find_grasp(draft: Draft, gap: float) -> np.ndarray:
-    """Close the hand round a ball that lies at the palm, `gap` m away from every link: the draft's posture and centre.
+def find_grasp(hand: Hand, gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Close a hand of `folder.write_hand` round a ball that lies at the palm, `gap` m away from every link.
 
     The ball is tried in places before the palm. At each place every finger bends until a link is `gap` away from the
     ball; the thumb takes the posture of a grid that opposes the fingers best.
 
     Returns:
-      How far [F] m each fingertip, the thumb's last, is from the ball.
+      Joint angles [J] rad, the ball's centre [3] m, and how far [F] m each fingertip, the thumb's first, is from the
+      ball.
     """
-    links, palm = draft.links, draft.palm
-    assert palm is not None, "fitted before"
-    thumb, *chains = draft.fingers.values()
-    paths, grid = [_bend(links, chain) for chain in chains], _grid(links, thumb)
-    shapes = [_capsules_at(links, chain, path) for chain, path in zip(chains, paths, strict=True)]
-    thumb_ends, thumb_radius = _capsules_at(links, thumb, grid)
-    roots, thumb_root = np.array([links[chain[0]].anchor for chain in chains]), links[thumb[0]].anchor
-    height = palm.centre[0] + palm.half[0] + BALL + 0.006
+    palm = next(geom for geom in hand.geoms if geom.name == "palm_box")
+    grid, *paths = _thumb_grid(hand), *(_bending(hand, finger) for finger in range(1, hand.num_fingers))
+    (thumb_ends, thumb_radius), *shapes = (_capsules(hand, finger, path) for finger, path in enumerate([grid, *paths]))
+    roots = np.array([hand.body_position[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
+    height = palm.position[0] + palm.size[0] + BALL + 0.006
     # Over the palm, or a little beyond the fingers' roots.
-    low = np.maximum(np.minimum(roots.min(0), thumb_root)[1:] - [0.0, 0.02], (palm.centre - palm.half)[1:] + BALL / 2)
-    high = np.maximum(np.maximum(roots.max(0), thumb_root)[1:] + [0.0, 0.06], low + _STEP)
+    low = np.maximum(roots.min(0)[1:] - [0.0, 0.02], (palm.position - palm.size)[1:] + BALL / 2)
+    high = np.maximum(roots.max(0)[1:] + [0.0, 0.06], low + _STEP)
     best_score = -np.inf
     for y, z in itertools.product(np.arange(low[0], high[0] + 1e-9, _STEP), np.arange(low[1], high[1], _STEP)):
         centre = np.array([height, y, z])
@@ -62,13 +59,12 @@ def find_grasp(draft: Draft, gap: float) -> np.ndarray:
         half_closed = -np.mean((_BENDS[bends] - _HALF) ** 2)  # fingers must have way left to close
         total = score[row] + holds.mean() + below.mean() + 2 * half_closed
         if total > best_score:
-            best_score, best = total, (centre, bends, row, np.append(near, clear[row, -1]))
-    centre, bends, row, gaps = best
-    draft.posture = {name: float(values[row]) for name, values in grid.items()}
-    for path, bend in zip(paths, bends, strict=True):
-        draft.posture |= {name: float(values[bend]) for name, values in path.items()}
-    draft.centre = np.round(centre, 4)
-    return gaps
+            best_score, best = total, (centre, [row, *bends], np.array([clear[row, -1], *near]))
+    centre, rows, gaps = best
+    # Each posture is the open hand with one finger bent.
+    opened = _opened(hand)
+    posture = opened + np.sum([path[row] - opened for path, row in zip([grid, *paths], rows, strict=True)], 0)
+    return posture, centre, gaps
 
 
 def is_near(gaps: np.ndarray, gap: float) -> np.ndarray:
@@ -77,49 +73,47 @@ def is_near(gaps: np.ndarray, gap: float) -> np.ndarray:
 
 
 def _gaps(ends: np.ndarray, radius: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Distances [N, C] m of a chain's capsules from the ball."""
+    """Distances [N, C] m of a finger's capsules from the ball."""
     return segment_distance(centre, ends[:, :, 0], ends[:, :, 1]) - radius - BALL
 
 
-def _bend(links: Sequence[Link], chain: Sequence[int]) -> dict[str, np.ndarray]:
-    """Motor angles [N] by joint of a finger that bends more and more; hinges that swing it sideways stay."""
-    angles, place = {}, 0
-    flexing = set(flexion_links(links, chain))
-    for at in chain:
-        link = links[at]
-        if link.is_motor:
-            share = _SHARES[min(place, len(_SHARES) - 1)] if at in flexing else 0.0
-            angles[link.joint] = np.clip(share * _BENDS, link.low, link.high)
-        place += at in flexing
-    return angles
+def _opened(hand: Hand) -> np.ndarray:
+    return np.clip(0.0, hand.joint_lower, hand.joint_upper)
 
 
-def _grid(links: Sequence[Link], chain: Sequence[int]) -> dict[str, np.ndarray]:
-    """Motor angles [N] by joint of a thumb: all combinations."""
-    motors = [links[at] for at in chain if links[at].is_motor]
-    steps = max(3, int(_THUMB_SAMPLES ** (1 / len(motors))))
-    axes = [np.linspace(j.low + 0.05 * (j.high - j.low), j.high - 0.05 * (j.high - j.low), steps) for j in motors]
-    values = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(motors))
-    return {motor.joint: values[:, i] for i, motor in enumerate(motors)}
+def _bending(hand: Hand, finger: int) -> np.ndarray:
+    """Postures [N, J] in which a finger bends more and more; hinges that swing it sideways stay."""
+    postures, shares, seen = np.tile(_opened(hand), (len(_BENDS), 1)), iter(_SHARES), set[int]()
+    flexing = flexion_joints(hand, range(finger, finger + 1))
+    for joint in hand.body_joint[finger_bodies(hand, finger)[::-1]]:
+        if joint in flexing:
+            share = next(shares)
+            if joint not in seen:  # else a hinge that follows
+                postures[:, joint] = np.clip(share * _BENDS, hand.joint_lower[joint], hand.joint_upper[joint])
+            seen.add(joint)
+    return postures
 
 
-def _capsules_at(
-    links: Sequence[Link], chain: Sequence[int], angles: Mapping[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Segments [N, C, 2, 3] and radii [C] of a chain's capsules, the tip's last, in postures of its motors."""
-    count = len(next(iter(angles.values())))
-    turn, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+def _thumb_grid(hand: Hand) -> np.ndarray:
+    """Postures [N, J] with all combinations of the thumb's joints."""
+    joints = sorted({int(joint) for joint in hand.body_joint[finger_bodies(hand, 0)]} - {-1})
+    steps = max(3, int(_THUMB_SAMPLES ** (1 / len(joints))))
+    shares = np.stack(np.meshgrid(*[np.linspace(0.05, 0.95, steps)] * len(joints), indexing="ij"), -1)
+    postures = np.tile(_opened(hand), (steps ** len(joints), 1))
+    low, high = hand.joint_lower[joints], hand.joint_upper[joints]
+    postures[:, joints] = low + shares.reshape(-1, len(joints)) * (high - low)
+    return postures
+
+
+def _capsules(hand: Hand, finger: int, postures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Segments [N, C, 2, 3] and radii [C] of a finger's capsules, the tip's last, in postures [N, J]."""
+    position, rotation = (np.stack(x) for x in zip(*(pose[:2] for pose in hand_poses(hand, postures)), strict=True))
     ends, radii = [], []
-    for link in (links[at] for at in chain):
-        motor = angles.get(link.leader or link.joint, np.zeros(count))
-        angle = link.offset + link.ratio * motor if link.leader else motor
-        # The product of exponentials: every hinge turns what is beyond it about a line that is fixed in the drawing.
-        own = Rotation.from_rotvec(np.outer(angle, link.axis)).as_matrix()
-        shift = shift + np.einsum("nij,nj->ni", turn, link.anchor - own @ link.anchor)
-        turn = turn @ own
-        if link.capsule is not None:
-            ends.append(np.einsum("nij,ej->nei", turn, link.capsule.ends) + shift[:, None])
-            radii.append(link.capsule.radius)
+    for body in finger_bodies(hand, finger)[-2::-1]:
+        for geom in (geom for geom in hand.geoms if geom.body == body):
+            own = geom.position + np.outer([-geom.size[1], geom.size[1]], geom.rotation[:, 2])
+            ends.append(position[:, None, body] + own @ rotation[:, body].swapaxes(-1, -2))
+            radii.append(geom.size[0])
     return np.stack(ends, 1), np.array(radii)
 
 

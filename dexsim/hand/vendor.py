@@ -59,25 +59,15 @@ class Link:
 @dataclasses.dataclass(eq=False, kw_only=True)
 class Draft:
     """A hand on the way from a maker's file to a folder. `read_hand` begins it, in the file's axes; `anatomy.orient`
-    finds fingers and signs and turns it into the library's palm frame; later steps fill in the rest."""
+    finds fingers and signs and turns it into the library's palm frame; `import_hand.fit_links` fills in the rest."""
 
     name: str
-    kind: str  # MJCF or URDF
     links: list[Link]
-    frozen: tuple[str, ...]  # joints that were taken for fixed: of a wrist, an arm, a floating base
-    notes: list[str]  # what could not be read, and what is in doubt
+    findings: list[str]  # lines for people: what was found, left out, assumed, and is in doubt
     # From `anatomy.orient`.
     fingers: dict[str, list[int]] = dataclasses.field(default_factory=dict)  # links up to the tip's; thumb first
-    rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))  # rows: palm axes in the file's
-    reversed: tuple[str, ...] = ()  # joints whose sign was turned round
     side: str = "right"  # or left
-    # From `import_hand.fit_links`.
-    palm: PalmBox | None = None
-    assumed: list[str] = dataclasses.field(default_factory=list)
-    # Of the first grasp, from `posture.find_grasp` and `import_hand.force_targets`.
-    posture: dict[str, float] = dataclasses.field(default_factory=dict)  # rad, by motor
-    centre: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # m
-    finger_force: tuple[float, float] = (1.0, 1.0)  # N, targets at command 0 and 1
+    palm: PalmBox | None = None  # from `import_hand.fit_links`
 
     @property
     def motors(self) -> list[Link]:
@@ -128,13 +118,10 @@ def _read(path: Path, palm: str, freeze: Sequence[str], couple: Sequence[str], d
         if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigError(f"joint {names[j]!r} is not a hinge: --freeze {names[j]} fixes it at 0")
     followers = _read_followers(model, names, joints, couple, notes)
-    return Draft(
-        name=root.get("name") or root.get("model") or path.stem,
-        kind="URDF" if root.tag == "robot" else "MJCF",
-        links=_read_links(model, at, below, joints, names, followers, _urdf_speeds(root)),
-        frozen=tuple(name for j, name in enumerate(names) if j not in joints),
-        notes=notes,
-    )
+    links = _read_links(model, at, below, joints, names, followers, _urdf_speeds(root))
+    if frozen := [name for j, name in enumerate(names) if j not in joints]:
+        notes.append(f"frozen at 0  {', '.join(frozen)}: above the palm, or by --freeze")
+    return Draft(name=root.get("name") or root.get("model") or path.stem, links=links, findings=notes)
 
 
 def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoco.MjSpec:
@@ -150,7 +137,7 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoc
         inertial = link.find("inertial")
         inertia = None if inertial is None else inertial.find("inertia")
         if inertial is not None and (inertia is None or np.any(np.linalg.eigvalsh(_tensor(inertia)) < _NO_INERTIA)):
-            notes.append(f"link {link.get('name')}: its inertia is no inertia, left out")
+            notes.append(f"note         link {link.get('name')}: its inertia is no inertia, left out")
             link.remove(inertial)
     for extra in root.findall("mujoco"):
         root.remove(extra)
@@ -182,7 +169,7 @@ def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, byte
     try:
         mesh = trimesh.load(_find_file(path, name), force="mesh", process=False)
     except Exception as error:  # each of trimesh's readers raises its own
-        notes.append(f"mesh {name}: {' '.join(str(error).split())[:80]}")
+        notes.append(f"note         mesh {name}: {' '.join(str(error).split())[:80]}")
         return False
     if not len(mesh.faces):
         return False
@@ -222,7 +209,7 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
     for geom in [geom for geom in spec.geoms if geom.meshname in missing]:
         spec.delete(geom)
     for mesh in [mesh for mesh in spec.meshes if mesh.name in missing]:
-        notes.append(f"mesh {mesh.file}: no such file")
+        notes.append(f"note         mesh {mesh.file}: no such file")
         spec.delete(mesh)
     return spec
 
@@ -266,7 +253,9 @@ def _read_followers(
     for e in range(model.neq):
         coupling = read_coupling(model, e)
         if coupling is None:
-            notes.append(f"equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints")
+            notes.append(
+                f"note         equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints"
+            )
         else:
             direct[coupling[0]] = coupling[1:]
     for text in couple:

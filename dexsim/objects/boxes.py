@@ -15,16 +15,17 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from scipy.optimize import minimize
 
 from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import AssetError
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import rotations, sdf
 
-_VERSION = 2  # of the files in the cache
+_VERSION = 3  # of the files in the cache
 _VOXELS = 28  # along the longest side
 _SEEDS = 120  # boxes grown for every one that is kept
-_STEPS = 400  # of the refinement
+_STEPS = 400  # of the refinement, at most
 _ALIKE = 0.002  # fits whose mean deviations differ by less, as a share of the mesh's size, are as good
 _WORST = (0.025, 0.1)  # largest deviation, mean and 99th percentile, as a share of the mesh's size
 
@@ -88,7 +89,7 @@ def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxe
     candidates = []
     for frame in frames:
         start = _start(mesh, frame, parts, rng)
-        refined = _refine(start, jnp.asarray(points, jnp.float32), jnp.asarray(distance, jnp.float32), extent)
+        refined = _refine(start, points.astype(np.float32), distance.astype(np.float32), extent)
         candidates += [_boxes(mesh, fit, rng) for fit in (start, refined)]
     # Among fits that are as good, the one with fewer boxes.
     return min(
@@ -97,17 +98,12 @@ def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxe
     )
 
 
-def _start(mesh: meshes.Trimesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> dict[str, jax.Array]:
-    """Boxes along the columns of `frame`: "position" [K, 3], "size" [K, 3] (logarithms), "quat" [K, 4]."""
+def _start(mesh: meshes.Trimesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> np.ndarray:
+    """Boxes along the columns of `frame` [K, 10]: position, logarithms of the half-extents, quaternion."""
     low, high = _grow(meshes.make_mesh("", mesh.vertices @ frame, mesh.faces), parts, rng)
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(frame, np.float64).ravel())
-    values = {
-        "position": (low + high) / 2 @ frame.T,
-        "size": np.log((high - low) / 2),
-        "quat": np.tile(quat, (len(low), 1)),
-    }
-    return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+    return np.column_stack([(low + high) / 2 @ frame.T, np.log((high - low) / 2), np.tile(quat, (len(low), 1))])
 
 
 def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -126,7 +122,7 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
             f"a mesh of {1000 * float((high - low).max()):.0f} mm has no inside at a resolution of {1000 * pitch:.1f} "
             "mm: its walls are too thin for boxes; give it as a solid"
         )
-    boxes: list[tuple[np.ndarray, np.ndarray]] = []
+    boxes: list[np.ndarray] = []
     for _ in range(parts):
         if left.sum() < 0.01 * inside.sum():
             break
@@ -134,98 +130,75 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
         chosen = rng.choice(len(seeds), min(_SEEDS, len(seeds)), replace=False, p=depth / depth.sum())
         grown = [_grow_one(inside, seeds[index], rng) for index in chosen]
         gain = [int(np.sum(left[_cut(box)])) - int(np.sum(~inside[_cut(box)])) for box in grown]
-        best = grown[int(np.argmax(gain))]
-        left[_cut(best)] = False
-        boxes.append(best)
+        boxes.append(grown[int(np.argmax(gain))])
+        left[_cut(boxes[-1])] = False
     corners = np.array(boxes)
-    return low + corners[:, 0] * cell, low + corners[:, 1] * cell
+    return low + corners[..., 0] * cell, low + corners[..., 1] * cell
 
 
-def _cut(box: tuple[np.ndarray, np.ndarray]) -> tuple[slice, ...]:
-    return tuple(slice(a, b) for a, b in zip(*box, strict=True))
+def _cut(box: np.ndarray) -> tuple[slice, ...]:
+    return tuple(slice(*span) for span in box)
 
 
-def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A box [first, last) round a voxel, layer by layer while nine tenths of a layer lie inside."""
-    first, last = seed.copy(), seed + 1
-    sides = list(range(6))
+def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A box [3, 2], first and last + 1, round a voxel, layer by layer while nine tenths of a layer lie inside."""
+    box, sides = np.stack([seed, seed + 1], 1), [[axis, end] for axis in range(3) for end in (0, 1)]
     while sides:
-        for side in rng.permutation(sides):
-            axis, ahead = side % 3, side >= 3
-            edge = last[axis] if ahead else first[axis] - 1
-            if not 0 <= edge < inside.shape[axis]:
-                sides.remove(side)
-                continue
-            layer = list(_cut((first, last)))
+        for axis, end in rng.permutation(sides).tolist():
+            edge = box[axis, end] - 1 + end
+            layer = [*_cut(box)]
             layer[axis] = slice(edge, edge + 1)
-            if np.mean(inside[tuple(layer)]) < 0.9:
-                sides.remove(side)
-            elif ahead:
-                last[axis] += 1
+            if 0 <= edge < inside.shape[axis] and np.mean(inside[tuple(layer)]) >= 0.9:
+                box[axis, end] += 2 * end - 1
             else:
-                first[axis] -= 1
-    return first, last
+                sides.remove([axis, end])
+    return box
 
 
-def _union(params: dict[str, jax.Array], points: jax.Array) -> jax.Array:
-    quat = params["quat"] / jnp.linalg.norm(params["quat"], axis=-1, keepdims=True)
+@jax.jit
+@jax.value_and_grad
+def _misfit(boxes: jax.Array, points: jax.Array, distance: jax.Array, band: jax.Array) -> jax.Array:
+    """How far [] the distance to the union of boxes [K, 10] is from the mesh's at points [P, 3]; distances count up to
+    `band` m from the surface."""
+    quat = boxes[:, 6:] / jnp.linalg.norm(boxes[:, 6:], axis=-1, keepdims=True)
 
     def one(position: jax.Array, size: jax.Array, quat: jax.Array) -> jax.Array:
         return sdf.box(sdf.to_local(points, position, rotations.quat_to_matrix(quat)), jnp.exp(size))
 
-    return jnp.min(jax.vmap(one)(params["position"], params["size"], quat), 0)
+    union = jnp.min(jax.vmap(one)(boxes[:, :3], boxes[:, 3:6], quat), 0)
+    error = (jnp.clip(union, -band, band) - jnp.clip(distance, -band, band)) / band
+    return jnp.mean(jnp.sqrt(error**2 + 1e-4))
 
 
-@jax.jit
-def _refine(
-    params: dict[str, jax.Array], points: jax.Array, distance: jax.Array, extent: jax.Array
-) -> dict[str, jax.Array]:
-    """Adam on the difference of the two distances, which count up to 8 % of the size from the surface."""
-    band = 0.08 * extent
+def _refine(start: np.ndarray, points: np.ndarray, distance: np.ndarray, extent: float) -> np.ndarray:
+    """Boxes [K, 10] of the least misfit near a start."""
+    scale = np.repeat([0.004 * extent, 0.02, 0.01], [3, 3, 4])
 
-    def loss(params: dict[str, jax.Array]) -> jax.Array:
-        error = (jnp.clip(_union(params, points), -band, band) - jnp.clip(distance, -band, band)) / band
-        return jnp.mean(jnp.sqrt(error**2 + 1e-4))
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        boxes = (start + scale * x.reshape(start.shape)).astype(np.float32)
+        value, slope = _misfit(boxes, points, distance, np.float32(0.08 * extent))
+        return float(value), np.ravel(np.asarray(slope, float) * scale)
 
-    pace = {"position": 0.004 * extent, "size": 0.02, "quat": 0.01}
-
-    def step(carry, index):
-        params, first, second = carry
-        slope = jax.grad(loss)(params)
-        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, slope)
-        second = jax.tree.map(lambda v, g: 0.99 * v + 0.01 * g * g, second, slope)
-        fade, at = 1 - index / _STEPS, index + 1.0
-        params = {
-            name: params[name]
-            - fade * pace[name] * (first[name] / (1 - 0.9**at)) / (jnp.sqrt(second[name] / (1 - 0.99**at)) + 1e-12)
-            for name in params
-        }
-        return (params, first, second), None
-
-    zero = jax.tree.map(jnp.zeros_like, params)
-    return jax.lax.scan(step, (params, zero, zero), jnp.arange(_STEPS, dtype=jnp.float32))[0][0]
+    best = minimize(cost, np.zeros(start.size), jac=True, method="L-BFGS-B", options={"maxiter": _STEPS})
+    return start + scale * best.x.reshape(start.shape)
 
 
-def _boxes(mesh: meshes.Trimesh, params: dict[str, jax.Array], rng: np.random.Generator) -> Boxes:
-    quat = np.asarray(params["quat"], np.float64)
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    size, position = np.exp(np.asarray(params["size"], np.float64)), np.asarray(params["position"], np.float64)
-    boxes = Boxes(size.astype(np.float32), position.astype(np.float32), quat.astype(np.float32), (0.0, 0.0))
-    skin = jnp.asarray(meshes.sample_surface(mesh, 2000, rng)[0], jnp.float32)
-    there = np.abs(np.asarray(sdf.signed_distance(skin, boxes.shape())))
-    back = np.abs(meshes.signed_distance(mesh, _on_surface(boxes, 2000, rng))[0])
-    both = np.concatenate([there, back])
+def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> Boxes:
+    """Boxes from [K, 10], with their deviation."""
+    import trimesh
+
+    position, size, quat = np.split(fit.astype(np.float32), [3, 6], axis=1)
+    boxes = Boxes(np.exp(size), position, quat / np.linalg.norm(quat, axis=1, keepdims=True), (0.0, 0.0))
+    shape = boxes.shape()
+    sides = []
+    for half, place, turn in zip(boxes.size, position, np.asarray(shape.rotation), strict=True):
+        side = trimesh.creation.box(2 * half)
+        side.vertices = side.vertices @ turn.T + place
+        sides.append(side)
+    # Of the boxes' own surfaces what is in no other box.
+    points = meshes.sample_surface(trimesh.util.concatenate(sides), 8000, rng)[0]
+    outside = np.asarray(sdf.signed_distance(points.astype(np.float32), shape)) > -1e-5
+    back = np.abs(meshes.signed_distance(mesh, points[outside][:2000])[0])
+    skin = meshes.sample_surface(mesh, 2000, rng)[0].astype(np.float32)
+    both = np.append(np.abs(sdf.signed_distance(skin, shape)), back)
     return dataclasses.replace(boxes, deviation=(float(both.mean()), float(np.percentile(both, 99))))
-
-
-def _on_surface(boxes: Boxes, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Random points on the union's surface, uniform by area."""
-    areas = np.stack([boxes.size[:, (k + 1) % 3] * boxes.size[:, (k + 2) % 3] for k in range(3)], 1)
-    pick = rng.choice(areas.size, 4 * count, p=(areas / areas.sum()).ravel())
-    box, axis = np.divmod(pick, 3)
-    unit = rng.uniform(-1, 1, (len(pick), 3))
-    unit[np.arange(len(pick)), axis] = rng.choice([-1.0, 1.0], len(pick))
-    turn = np.asarray(rotations.quat_to_matrix(jnp.asarray(boxes.quat)))[box]
-    points = np.einsum("nij,nj->ni", turn, unit * boxes.size[box]) + boxes.position[box]
-    outside = np.asarray(sdf.signed_distance(jnp.asarray(points, jnp.float32), boxes.shape())) > -1e-5
-    return points[outside][:count]

@@ -7,12 +7,12 @@ the principal axes that are nearest to them.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from functools import lru_cache
 from pathlib import Path
 
 import jax
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from dexsim.geometry import mesh as meshes
 from dexsim.objects.boxes import Boxes, fit_boxes
@@ -73,12 +73,9 @@ def principal_axes(tensor: np.ndarray) -> np.ndarray:
     if np.abs(products).max() <= _ALIGNED * np.trace(tensor) / 3:
         return np.eye(3)
     vectors = np.linalg.eigh(tensor)[1]
-
-    def turned(order: tuple[int, ...]) -> np.ndarray:
-        axes = vectors[:, order]
-        axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
-        if np.linalg.det(axes) < 0:
-            axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1
-        return axes
-
-    return max(map(turned, itertools.permutations(range(3))), key=np.trace)
+    _, order = linear_sum_assignment(np.abs(vectors), maximize=True)
+    axes = vectors[:, order]
+    axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
+    if np.linalg.det(axes) < 0:
+        axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1
+    return axes

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -53,91 +52,71 @@ def _font(size: int):
     return ImageFont.load_default(size)
 
 
-class Panel:
-    """A panel of `width` x `height` pixels for a hand: two columns of blocks, its fingers in order and the read-outs
-    last."""
+def draw_panel(
+    hand: Hand,
+    size: tuple[int, int],
+    snapshot: Snapshot,
+    force_range: float,
+    finger_range: float,
+    lines: Mapping[str, str],
+    captions: tuple[str, str] = TRUE,
+) -> np.ndarray:
+    """A panel of `size` (width, height) pixels, uint8 [height, width, 3]: two columns of blocks, the fingers in order
+    and the read-outs last.
 
-    def __init__(self, hand: Hand, width: int, height: int):
-        self.names, self.grid, self.size = hand.finger_names, hand.taxel_grid, (width, height)
-        columns, rows = self.grid
-        lines = (len(self.names) + 2) // 2
-        self._font_size = max(8, round(height / 36))
-        # A block is a title line, the map and a force bar, with air below.
-        self._cell = max(2, min((height // lines - int(2.6 * self._font_size)) // rows, int(width * 0.42) // columns))
-        block_width, block_height = self._cell * columns, self._cell * rows + int(2.0 * self._font_size)
-        left, top = (width - 2 * block_width) // 3, (height - lines * block_height) // (lines + 1)
-        self._slots = [
-            (left + (k % 2) * (block_width + left), top + (k // 2) * (block_height + top))
-            for k in range(len(self.names) + 1)
-        ]
+    `lines` are read-outs (`read_outs`), `captions` say what maps and bars show. The bar under a map is the finger's
+    force out of `finger_range` N; its mark is the target.
+    """
+    from PIL import Image, ImageDraw
 
-    def draw(
-        self,
-        snapshot: Snapshot,
-        force_range: float,
-        finger_range: float,
-        lines: Mapping[str, str],
-        captions: tuple[str, str] = TRUE,
-    ) -> np.ndarray:
-        """The panel as uint8 [height, width, 3].
-
-        `lines` are read-outs (`read_outs`), `captions` say what maps and bars show. The bar under a map is the finger's
-        force out of `finger_range` N; its mark is the target.
-        """
-        from PIL import Image, ImageDraw
-
-        image = Image.new("RGB", self.size, PANEL)
-        draw = ImageDraw.Draw(image)
-        self._draw_scale(image, draw, force_range)
-        font_size, cell = self._font_size, self._cell
-        font, pad = _font(font_size), int(1.3 * font_size)
-        width, height = cell * self.grid[0] - _GAP, cell * self.grid[1]
-        force, target = np.asarray(snapshot.taxel_force), float(snapshot.target_force)
-        colors = np.where(force[..., None] > 0, force_color(force, force_range), np.array(EMPTY, np.uint8))
-        gap = np.arange(cell) >= cell - _GAP
-        for f, (x, y) in enumerate(self._slots[:-1]):
-            total = float(snapshot.finger_force[f])
-            draw.text((x, y), self.names[f], fill=INK, font=font)
-            draw.text((x + width, y), f"{total:.1f} N", fill=INK, font=font, anchor="ra")
-            cells = taxel_image(colors[f], self.grid).repeat(cell, 0).repeat(cell, 1)
-            cells[np.tile(gap, self.grid[1])] = PANEL
-            cells[:, np.tile(gap, self.grid[0])] = PANEL
-            image.paste(Image.fromarray(cells), (x, y + pad))
-            bar, thick = y + pad + height + 2, max(2, font_size // 4)
-            draw.rectangle((x, bar, x + width - 1, bar + thick), fill=EMPTY)
-            filled = int(np.clip(total / finger_range, 0, 1) * width)
-            if filled > 0:
-                draw.rectangle((x, bar, x + filled - 1, bar + thick), fill=ACCENT)
-            if np.isfinite(target) and 0 < target <= finger_range:
-                mark = x + int(target / finger_range * (width - 1))
-                draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
-        x, y = self._slots[-1]
-        # Above the colour scale; a small panel has little room.
-        room = height - max(4, cell)
-        pitch = min(round(1.35 * font_size), room // max(len(captions) + len(lines), 1))
-        small = _font(min(font_size - 2, pitch))
-        for caption in captions:
-            draw.text((x, y), caption, fill=FAINT, font=small)
-            y += pitch
-        for name, value in lines.items():
-            fits = draw.textlength(name + value, font) + font_size < width
-            draw.text((x, y), name, fill=FAINT, font=font if fits else small)
-            draw.text((x + width, y), value, fill=INK, font=font if fits else small, anchor="ra")
-            y += pitch
-        return np.asarray(image)
-
-    def _draw_scale(self, image: Any, draw: Any, force_range: float) -> None:
-        """The colour scale at the bottom of the read-outs' block."""
-        from PIL import Image
-
-        width = self._cell * self.grid[0] - _GAP
-        x, y = self._slots[-1]
-        small, bar = _font(self._font_size - 2), max(4, self._cell)
-        top = y + self._cell * self.grid[1] - bar
-        scale = force_color(np.linspace(0, force_range, width)[None].repeat(bar, 0), force_range)
-        image.paste(Image.fromarray(scale), (x, top))
-        draw.text((x, top + bar + 3), "0", fill=FAINT, font=small)
-        draw.text((x + width, top + bar + 3), f"{force_range:.2g} N / taxel", fill=FAINT, font=small, anchor="ra")
+    (columns, rows), count = hand.taxel_grid, (hand.num_fingers + 2) // 2
+    font_size = max(8, round(size[1] / 36))
+    # A block is a title line, the map and a force bar, with air below.
+    cell = max(2, min((size[1] // count - int(2.6 * font_size)) // rows, int(size[0] * 0.42) // columns))
+    width, height, pad = cell * columns - _GAP, cell * rows, int(1.3 * font_size)
+    step = cell * columns, height + int(2.0 * font_size)
+    left, top = (size[0] - 2 * step[0]) // 3, (size[1] - count * step[1]) // (count + 1)
+    slots = [(left + k % 2 * (step[0] + left), top + k // 2 * (step[1] + top)) for k in range(hand.num_fingers + 1)]
+    image = Image.new("RGB", size, PANEL)
+    draw, font, target = ImageDraw.Draw(image), _font(font_size), float(snapshot.target_force)
+    force = np.asarray(snapshot.taxel_force)
+    colors = np.where(force[..., None] > 0, force_color(force, force_range), np.array(EMPTY, np.uint8))
+    gap = np.arange(cell) >= cell - _GAP
+    for f, (x, y) in enumerate(slots[:-1]):
+        total = float(snapshot.finger_force[f])
+        draw.text((x, y), hand.finger_names[f], fill=INK, font=font)
+        draw.text((x + width, y), f"{total:.1f} N", fill=INK, font=font, anchor="ra")
+        cells = taxel_image(colors[f], hand.taxel_grid).repeat(cell, 0).repeat(cell, 1)
+        cells[np.tile(gap, rows)] = PANEL
+        cells[:, np.tile(gap, columns)] = PANEL
+        image.paste(Image.fromarray(cells), (x, y + pad))
+        bar, thick = y + pad + height + 2, max(2, font_size // 4)
+        draw.rectangle((x, bar, x + width - 1, bar + thick), fill=EMPTY)
+        filled = int(np.clip(total / finger_range, 0, 1) * width)
+        if filled > 0:
+            draw.rectangle((x, bar, x + filled - 1, bar + thick), fill=ACCENT)
+        if np.isfinite(target) and 0 < target <= finger_range:
+            mark = x + int(target / finger_range * (width - 1))
+            draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
+    # The colour scale, and above it the read-outs; a small panel has little room.
+    x, y = slots[-1]
+    small, thick = _font(font_size - 2), max(4, cell)
+    bar = y + height - thick
+    scale = force_color(np.linspace(0, force_range, width)[None].repeat(thick, 0), force_range)
+    image.paste(Image.fromarray(scale), (x, bar))
+    draw.text((x, bar + thick + 3), "0", fill=FAINT, font=small)
+    draw.text((x + width, bar + thick + 3), f"{force_range:.2g} N / taxel", fill=FAINT, font=small, anchor="ra")
+    pitch = min(round(1.35 * font_size), (height - thick) // max(len(captions) + len(lines), 1))
+    small = _font(min(font_size - 2, pitch))
+    for caption in captions:
+        draw.text((x, y), caption, fill=FAINT, font=small)
+        y += pitch
+    for name, value in lines.items():
+        fits = draw.textlength(name + value, font) + font_size < width
+        draw.text((x, y), name, fill=FAINT, font=font if fits else small)
+        draw.text((x + width, y), value, fill=INK, font=font if fits else small, anchor="ra")
+        y += pitch
+    return np.asarray(image)
 
 
 def read_outs(snapshot: Snapshot) -> dict[str, str]:

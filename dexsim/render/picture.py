@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.description import Hand
+from dexsim.hand.mjcf import Pose
 from dexsim.render.camera import Camera, CameraView, look, unit
 from dexsim.render.panel import force_color
 
@@ -48,15 +49,6 @@ def linear(color: Color) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-class Pose(NamedTuple):
-    """Where the hand's parts are, NumPy."""
-
-    body_position: np.ndarray  # [B, 3] m
-    body_rotation: np.ndarray  # [B, 3, 3]
-    taxel_position: np.ndarray  # [F, N, 3] m
-    taxel_normal: np.ndarray  # [F, N, 3]
-
-
 class Primitives(NamedTuple):
     """G posed primitives in the palm frame; sizes are MuJoCo's."""
 
@@ -73,31 +65,6 @@ class Surface(NamedTuple):
     depth: np.ndarray  # [H, W] m, 1e6 where empty
     primitive: np.ndarray  # [H, W] int, -1 where empty
     normal: np.ndarray  # [H, W, 3] unit, outward
-
-
-def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
-    """Poses of T frames from joint angles [T, J] rad, by MuJoCo."""
-    model, data = _plant(hand)
-    bodies = [model.body(name).id for name in hand.body_names]
-    moving = np.flatnonzero(hand.body_joint >= 0)
-    hinges = model.jnt_qposadr[model.body_jntadr[np.array(bodies)[moving]]]
-    poses = []
-    for angles in np.asarray(joint_position, float):
-        data.qpos[hinges] = angles[hand.body_joint[moving]] * hand.body_ratio[moving] + hand.body_offset[moving]
-        mujoco.mj_kinematics(model, data)
-        palm = data.xmat[bodies[0]].reshape(3, 3)
-        position = (data.xpos[bodies] - data.xpos[bodies[0]]) @ palm
-        rotation = palm.T @ data.xmat[bodies].reshape(-1, 3, 3)
-        tips = rotation[hand.tip_body].swapaxes(-1, -2)
-        taxels = position[hand.tip_body, None] + hand.taxel_position @ tips
-        poses.append(Pose(*(x.astype(np.float32) for x in (position, rotation, taxels, hand.taxel_normal @ tips))))
-    return poses
-
-
-@lru_cache(maxsize=4)
-def _plant(hand: Hand) -> tuple[Any, Any]:
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    return model, mujoco.MjData(model)
 
 
 def draw_scene(
@@ -119,7 +86,10 @@ def draw_scene(
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
     canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth, _TAXEL_GLOW)
     if frame.goal_rotation is not None:
-        goal = goal_primitives(held, frame, camera)
+        # The object again, smaller and in its goal orientation.
+        turn = frame.goal_rotation @ frame.object_rotation.T
+        position = goal_position(camera) + _GOAL_SCALE * (held.position - frame.object_position) @ turn.T
+        goal = held._replace(size=_GOAL_SCALE * held.size, position=position, rotation=turn @ held.rotation)
         marker = canvas.cast(goal)
         canvas.paint(goal, marker, marker.depth < np.minimum(links.depth, front.depth), _GOAL_OPACITY)
     return canvas.develop()
@@ -158,13 +128,6 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
 def goal_position(camera: Camera) -> np.ndarray:
     """Where [3] m the goal is shown: in the upper left of the picture, beside the hand."""
     return np.asarray(camera.target) + _GOAL_AT @ look(camera, (2, 2)).axes[:2]
-
-
-def goal_primitives(held: Primitives, frame: Any, camera: Camera) -> Primitives:
-    """The object again, smaller and in its goal orientation."""
-    turn = frame.goal_rotation @ frame.object_rotation.T
-    position = goal_position(camera) + _GOAL_SCALE * (held.position - frame.object_position) @ turn.T
-    return held._replace(size=_GOAL_SCALE * held.size, position=position, rotation=turn @ held.rotation)
 
 
 def cast(primitives: Primitives, view: CameraView, rays: np.ndarray) -> Surface:

@@ -16,9 +16,10 @@ import numpy as np
 from dexsim.core.files import write_atomic
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
+from dexsim.hand.mjcf import Pose, hand_poses
 from dexsim.render.camera import Camera
-from dexsim.render.panel import Panel, read_outs, taxel_image
-from dexsim.render.picture import Pose, draw_scene, hand_poses
+from dexsim.render.panel import draw_panel, read_outs, taxel_image
+from dexsim.render.picture import draw_scene
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {
@@ -127,13 +128,13 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
     if np.shape(snapshot.primitive_size)[-2] != len(kinds):
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
     camera = camera_of(camera, hand) if isinstance(camera, str) else camera
-    panel = Panel(hand, panel_width, height)
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
     finger_range = finger_range or 1.0
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
-        return np.concatenate([scene, panel.draw(frame, force_range, finger_range, read_outs(frame))], 1)
+        panel = draw_panel(hand, (panel_width, height), frame, force_range, finger_range, read_outs(frame))
+        return np.concatenate([scene, panel], 1)
 
     return draw
 

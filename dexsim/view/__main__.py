@@ -63,7 +63,7 @@ def open_source(arguments: ViewArguments) -> "Source":
         return Emulation(name, arguments.seed, arguments.hand)
     from dexsim.hand.load import load_hand
     from dexsim.registry import find_task, make
-    from dexsim.view.simulation import NONE, PolicyShelf, Simulation
+    from dexsim.view.simulation import NONE, Simulation, find_policies
     from dexsim_ppo.policy import load_policy
 
     try:
@@ -82,7 +82,7 @@ def open_source(arguments: ViewArguments) -> "Source":
         env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
     else:
         env = policy.make_env(hand=hand)
-    return Simulation(env, PolicyShelf(env, name), arguments.seed)
+    return Simulation(env, find_policies(env, name), arguments.seed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

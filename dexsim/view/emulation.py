@@ -1,10 +1,12 @@
 """The emulated hand with a policy, in virtual time: true poses, and touch as the bridge measures it."""
 
+from typing import Any
+
 import numpy as np
 
 from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Control, Frame, Slider, Values
+from dexsim.view.source import Frame
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
@@ -34,21 +36,23 @@ class Emulation:
         self._calibration = ideal_calibration(self.hand)
         self.period, self.task, self._seed, self._trial = self._controller.period, policy.task, seed, -1
 
-    def controls(self) -> dict[str, Control]:
+    def add_controls(self, gui: Any) -> None:
         """The grip command, where the policy takes one."""
-        return {} if self._controller.spec.turn else {"command": Slider(0.0, 1.0, 0.05, 0.5)}
+        self._command = None
+        if not self._controller.spec.turn:
+            self._command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5)
 
-    def reset(self, values: Values) -> Frame:
+    def reset(self) -> Frame:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
         self._run = VirtualRun(plant, self._controller, self._calibration)
         self._ticks = self._run.ticking()
-        return self.step(values)
+        return self.step()
 
-    def step(self, values: Values) -> Frame:
-        self._run.policy.command = values.get("command", 0.5)
+    def step(self) -> Frame:
+        self._run.policy.command = self._command.value if self._command else 0.5
         if next(self._ticks, None) is None:
-            return self.reset(values)
+            return self.reset()
         return self._frame()
 
     def _frame(self) -> Frame:
@@ -75,4 +79,5 @@ class Emulation:
             turns=goals.successes if goals else None,
             seconds=self._run.port.time,
         )
-        return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}")
+        command = policy.command if self._command else None
+        return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}", command)

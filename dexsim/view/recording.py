@@ -1,15 +1,14 @@
 """Recorded episodes, tick by tick: of an .npz, or the log of a run on a hand as the bridge measured it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import Episodes
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Control, Frame, Slider, Values
-
-_TIME = "go to [s]"
+from dexsim.view.source import Frame
 
 
 class Recording:
@@ -22,21 +21,21 @@ class Recording:
         self._episodes, self.hand, self.period = episodes.snapshots, episodes.hand, episodes.period
         self.task, self._kinds, self._number, self._tick = episodes.task, episodes.kinds, -1, 0
 
-    def controls(self) -> dict[str, Control]:
+    def add_controls(self, gui: Any) -> None:
         """The time at which episodes begin."""
-        longest = max(len(episode.joint_position) for episode in self._episodes)
-        return {_TIME: Slider(0.0, longest * self.period, 0.01, 0.0)}
+        longest = max(len(episode.joint_position) for episode in self._episodes) * self.period
+        self._begin = gui.add_slider("go to [s]", min=0.0, max=longest, step=0.01, initial_value=0.0)
 
-    def reset(self, values: Values) -> Frame:
+    def reset(self) -> Frame:
         self._number = (self._number + 1) % len(self._episodes)
         seconds = self._episodes[self._number].seconds
-        self._tick = min(int(np.searchsorted(seconds, values.get(_TIME, 0.0))), len(seconds) - 1)
+        self._tick = min(int(np.searchsorted(seconds, self._begin.value)), len(seconds) - 1)
         return self._frame()
 
-    def step(self, values: Values) -> Frame:
+    def step(self) -> Frame:
         self._tick += 1
         if self._tick == len(self._episodes[self._number].joint_position):
-            return self.reset(values)
+            return self.reset()
         return self._frame()
 
     def _frame(self) -> Frame:

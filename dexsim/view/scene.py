@@ -11,9 +11,10 @@ import numpy as np
 import trimesh
 
 from dexsim.hand.description import Hand, primitive_mesh
+from dexsim.hand.mjcf import Pose, hand_poses
 from dexsim.render.camera import look
 from dexsim.render.panel import force_color
-from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, Pose, hand_poses
+from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color
 from dexsim.render.render import camera_of
 from dexsim.view.source import Frame
 

@@ -17,58 +17,36 @@ from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
-from dexsim.view.source import Button, Choice, Control, Frame, Slider, Values
+from dexsim.view.source import Frame, clicked
 from dexsim_ppo.policy import Policy, load_policy
-
-_ANY = "any"
-_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
-_SHOWN = 1.0  # s that a dropped object stays in sight
-
 
 NONE = "none"
 """The choice of no policy: actions are zero."""
+_ANY = "any"
+_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
+_SHOWN = 1.0  # s that a dropped object stays in sight
 _NEWEST = 20  # files of runs that are listed
 
 
-class PolicyShelf:
-    """Policies that take an environment's observation, by the name of a shipped one or the path of a file, which is
-    read again when it changes. The view begins with `first`."""
-
-    def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
-        self._layout, self._runs, self._first = tuple(env.observation_layout["actor"]), runs, first
-        self._shipped = sorted(path.stem for path in asset_path("policies").glob("*.msgpack"))
-        self._loaded: dict[str, tuple[float, Policy | None]] = {}
-
-    def names(self) -> tuple[str, ...]:
-        """What can be chosen now: the first policy, then shipped ones, then the newest files of runs."""
-        files = [path for name in ("best", "last") for path in self._runs.glob(f"*/{name}.msgpack")]
-        newest = sorted(files, key=_changed, reverse=True)[:_NEWEST]
-        listed = dict.fromkeys([self._first, *self._shipped, *map(str, newest), NONE])
-        return tuple(name for name in listed if name == NONE or self.get(name) is not None)
-
-    def get(self, name: str) -> Policy | None:
-        """The policy of this name as its file is now; None where it is unsound, does not fit, or is `NONE`."""
-        if name == NONE:
-            return None
-        time = 0.0 if name in self._shipped else _changed(Path(name))
-        read, policy = self._loaded.get(name, (-1.0, None))
-        if time != read:
-            with contextlib.suppress(CheckpointError, OSError):  # being replaced: keep its last sound policy
-                new = load_policy(name)
-                policy = new if new.observation_layout == self._layout else None
-            self._loaded[name] = time, policy
-        return policy
-
-
-def _changed(path: Path) -> float:
-    """When a file was last written, s; 0 if it is gone."""
-    return path.stat().st_mtime if path.exists() else 0.0
+def find_policies(env: Env, first: str, runs: Path = Path("runs")) -> dict[str, Policy | None]:
+    """Policies that take an environment's observation, by the name of a shipped one or the path of a file: `first`,
+    shipped ones, the newest files of `runs`, and `NONE`."""
+    shipped = sorted(path.stem for path in asset_path("policies").glob("*.msgpack"))
+    files = [path for name in ("best", "last") for path in runs.glob(f"*/{name}.msgpack")]
+    newest = sorted(files, key=lambda path: -path.stat().st_mtime)[:_NEWEST]
+    fitting: dict[str, Policy | None] = {}
+    for name in dict.fromkeys([first, *shipped, *map(str, newest), NONE]):
+        with contextlib.suppress(CheckpointError):  # damaged, or being replaced
+            policy = None if name == NONE else load_policy(name)
+            if policy is None or policy.observation_layout == tuple(env.observation_layout["actor"]):
+                fitting[name] = policy
+    return fitting
 
 
 class Simulation:
     """Episodes of an environment; the page chooses policy, object, command, friction and pushes."""
 
-    def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
+    def __init__(self, env: Env, policies: dict[str, Policy | None], seed: int = 0):
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies
         self.task = env.name
         self._random = np.random.default_rng(seed)
@@ -82,52 +60,48 @@ class Simulation:
         self._snapshot = jit(functools.partial(take_snapshot, env), backend=env.backend)
         self._acting: Any = None  # the policy that the carry is of
         self._carry: Any = None
-        self._state: State = self._begin({})
+        self._state: State
 
-    def controls(self) -> dict[str, Control]:
+    def add_controls(self, gui: Any) -> None:
         """Policy, object (where the task has several), command (where it has one), friction and pushes."""
+        self._policy = gui.add_dropdown("policy", tuple(self.policies))
         kinds = [KINDS[index] for index in np.unique(self._shapes)]
-        return {
-            "policy": Choice(self.policies.names()),
-            **({"object": Choice((_ANY, *kinds))} if len(kinds) > 1 else {}),
-            **({"command": Slider(0.0, 1.0, 0.05, 0.5)} if hasattr(self._goal, "command") else {}),
-            "friction factor": Slider(0.1, 2.0, 0.05, 1.0),
-            "push [m/s]": Slider(0.0, 2.0, 0.1, _PUSH),
-            "push": Button(),
-        }
+        self._kind = gui.add_dropdown("object", (_ANY, *kinds)) if len(kinds) > 1 else None
+        self._command = None
+        if hasattr(self._goal, "command"):
+            self._command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5)
+        self._friction = gui.add_slider("friction factor", min=0.1, max=2.0, step=0.05, initial_value=1.0)
+        self._speed = gui.add_slider("push [m/s]", min=0.0, max=2.0, step=0.1, initial_value=_PUSH)
+        self._push = gui.add_button("push")
 
-    def reset(self, values: Values) -> Frame:
-        self._state = self._begin(values)
+    def reset(self) -> Frame:
+        kind = self._kind.value if self._kind else _ANY
+        rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
+        self._key, key = jax.random.split(self._key)
+        row = self._random.choice(rows)
+        self._state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
+        object, self._ended, self._acting = self._state.episode.object, 0.0, None
+        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
         return self._frame()
 
-    def step(self, values: Values) -> Frame:
+    def step(self) -> Frame:
         if self._ended >= _SHOWN:
-            return self.reset(values)
-        policy = self.policies.get(values["policy"])
+            return self.reset()
+        policy = self.policies[self._policy.value]
         if policy is not self._acting:  # another one, or another episode
             self._acting, self._carry = policy, policy and policy.initial_carry()
         action = jnp.zeros(self.env.action_size)
         if policy is not None:
             self._carry, action = policy.act(self._carry, self._state.obs["actor"])
         push = np.zeros(3, np.float32)
-        if values["push"]:
+        if clicked(self._push):
             push = self._random.normal(size=3).astype(np.float32)
-            push *= np.float32(values["push [m/s]"] / np.linalg.norm(push))
-        command = np.float32(values.get("command", 0.0))
-        self._state = self._step(self._state, action, command, np.float32(values["friction factor"]), push, self._bare)
+            push *= np.float32(self._speed.value / np.linalg.norm(push))
+        command = np.float32(self._command.value if self._command else 0.0)
+        self._state = self._step(self._state, action, command, np.float32(self._friction.value), push, self._bare)
         dropped = bool(self._state.terminated) or self._ended > 0
         self._ended = self._ended + self.period if dropped else 0.0
         return self._frame("dropped" if dropped else "")
-
-    def _begin(self, values: Values) -> State:
-        kind = values.get("object", _ANY)
-        rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
-        self._key, key = jax.random.split(self._key)
-        row = self._random.choice(rows)
-        state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
-        object, self._ended, self._acting = state.episode.object, 0.0, None
-        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
-        return state
 
     def _tick(
         self, state: State, action: jax.Array, command: jax.Array, friction: jax.Array, push: jax.Array, bare: Any
@@ -144,4 +118,5 @@ class Simulation:
         return self.env.step(dataclasses.replace(state, episode=episode, physics=physics, goal=goal), action)
 
     def _frame(self, note: str = "") -> Frame:
-        return Frame(jax.device_get(self._snapshot(self._state)), self.env.primitive_kinds, note)
+        command = self._command.value if self._command else None
+        return Frame(jax.device_get(self._snapshot(self._state)), self.env.primitive_kinds, note, command)

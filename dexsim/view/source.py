@@ -1,6 +1,5 @@
-"""What a view shows: frames from a source, and what of it can be changed."""
+"""What a view shows: frames from a source, which also says what of it can be changed."""
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from dexsim.hand.description import Hand
@@ -15,30 +14,8 @@ class Frame(NamedTuple):
     """Kinds of the object's primitives [K]; empty where the shape is not known."""
     note: str = ""
     """What happened, such as "dropped"."""
-
-
-class Slider(NamedTuple):
-    """A number that the page can set."""
-
-    low: float
-    high: float
-    step: float
-    value: float
-
-
-class Choice(NamedTuple):
-    """One of some names that the page can set."""
-
-    options: tuple[str, ...]
-
-
-class Button(NamedTuple):
-    """Something that the page can ask for; its value is True in the one step after a click."""
-
-
-Control = Slider | Choice | Button
-Values = Mapping[str, Any]
-"""The page's settings, by the names of the controls."""
+    command: float | None = None
+    """The command that the page asks for, to which a force loop adds."""
 
 
 class Source(Protocol):
@@ -50,14 +27,20 @@ class Source(Protocol):
     task: str
     """Of whose preset camera the page opens with (`dexsim.render.render.camera_of`)."""
 
-    def controls(self) -> dict[str, Control]:
-        """What can be changed now, by name. Asked again while the view runs: options may come and go."""
+    def add_controls(self, gui: Any) -> None:
+        """Put what can be changed on the page, before anything else is asked for: `gui` is viser's."""
         ...
 
-    def reset(self, values: Values) -> Frame:
+    def reset(self) -> Frame:
         """Begin anew."""
         ...
 
-    def step(self, values: Values) -> Frame:
+    def step(self) -> Frame:
         """The next frame; begins anew by itself after an end."""
         ...
+
+
+def clicked(button: Any) -> bool:
+    """Whether a button of viser was clicked since this was last asked."""
+    was, button.value = button.value, False
+    return was

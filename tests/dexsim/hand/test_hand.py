@@ -178,6 +178,8 @@ BROKEN = {
     "slide joint": ("xml", BEND, f'type="slide" {BEND}', "hinge"),
     "no range": ("xml", BEND, 'axis="-1 0 0" range="0 0" limited="false" actuatorfrcrange="-1 1"', "index_bend"),
     "no torque limit": ("xml", BEND, 'axis="-1 0 0" range="-0.174 0.174"', "actuatorfrcrange"),
+    "no inertia": ("xml", '<inertial mass="0.0158240"', '<inertial mass="0"', "mass"),
+    "tip twice": ("toml", 'tip = "ring_tip"', 'tip = "mid_tip"', "'mid_tip' is on"),
     "unknown joint": ("toml", '"index_bend",', '"index_bent",', "Invalid name 'index_bent'"),
     "root joint of another finger": ("toml", 'root_joint = "mid_joint1"', 'root_joint = "ring_joint1"', "not move"),
     "misspelt entry": ("toml", "palm = ", "taxel_pich = 1\npalm = ", "'taxel_pich'"),

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from shapes import solid
 
 from dexsim.check_hand import check_taxels
+from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
 from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
 from dexsim.hand.load import load_hand
@@ -18,8 +19,9 @@ from dexsim.hand.load import load_hand
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])
 def test_neighbours_are_a_pitch_apart(kind):
-    taxels = lay_taxels("plane", (9, 8), pitch=0.002, kind=kind)
-    flat = taxels[:, :2]
+    """On a straight part, unrolled."""
+    taxels = lay_taxels((9, 8), pitch=0.002, kind=kind, radius=0.01, half_length=0.1)
+    flat = np.stack([0.01 * np.arctan2(taxels[:, 1], taxels[:, 0]), taxels[:, 2]], 1)
     gap = cKDTree(flat).query(flat, k=7)[0][:, 1:]
     np.testing.assert_allclose(gap[:, 0], 0.002, rtol=1e-9)
     neighbours = np.sum(np.isclose(gap, 0.002), 1)
@@ -29,36 +31,33 @@ def test_neighbours_are_a_pitch_apart(kind):
     np.testing.assert_allclose(taxels[:, 6], 0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
 
 
-@pytest.mark.parametrize(
-    ("kind", "sizes", "shape"),
-    [
-        ("cylinder", {"radius": 0.008}, solid("cylinder", 0.008, 0.1)),
-        ("capsule", {"radius": 0.008, "half_length": 0.006}, solid("capsule", 0.008, 0.006)),
-        ("sphere", {"radius": 0.012}, solid("sphere", 0.012)),
-    ],
-)
-def test_taxels_lie_on_their_surface_wherever_it_is(kind, sizes, shape):
-    taxels = lay_taxels(kind, (7, 9), pitch=0.002, **sizes)
+@pytest.mark.parametrize("straight", [0.006, 0.0])
+def test_taxels_lie_on_their_surface_wherever_it_is(straight):
+    sizes = {"radius": 0.012, "half_length": straight}
+    taxels = lay_taxels((7, 9), pitch=0.002, **sizes)
     position, normal = taxels[:, :3], taxels[:, 3:6]
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-12)
     above = position + 1e-5 * normal
-    distance, away = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), shape)
+    distance, away = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), solid("capsule", 0.012, straight))
     np.testing.assert_allclose(distance, 1e-5, atol=1e-8)
     np.testing.assert_allclose(away, normal, atol=1e-5)
-    # Rows keep their pitch in arc length everywhere, columns on the straight part.
-    place, radius = position.reshape(7, 9, 3), sizes["radius"]
+    # Rows keep their pitch in arc length everywhere, columns in the middle.
+    place = position.reshape(7, 9, 3)
     chord = np.linalg.norm(np.diff(place[3], axis=0), axis=1)
-    assert np.all((chord > 2 * radius * np.sin(0.001 / radius) - 1e-9) & (chord < 0.002 + 1e-9))
+    assert np.all((chord > 2 * 0.012 * np.sin(0.001 / 0.012) - 1e-9) & (chord < 0.002 + 1e-9))
     across = np.linalg.norm(np.diff(place[:, 4], axis=0), axis=1)
-    np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
+    np.testing.assert_allclose(across, 2 * 0.012 * np.sin(0.001 / 0.012), rtol=1e-9)
     turn = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()
-    moved = lay_taxels(kind, (7, 9), pitch=0.002, **sizes, position=(0.1, 0, 0), rotation=turn)
+    moved = lay_taxels((7, 9), pitch=0.002, **sizes, position=(0.1, 0, 0), rotation=turn)
     np.testing.assert_allclose((moved[:, :3] - [0.1, 0, 0]) @ turn, position, atol=1e-12)
     np.testing.assert_allclose(moved[:, 3:6] @ turn, normal, atol=1e-12)
+    for grid, says in (((90, 3), "laps itself"), ((3, 90), "beyond the pole")):
+        with pytest.raises(ConfigError, match=says):
+            lay_taxels(grid, pitch=0.002, **sizes)
 
 
 def test_a_written_layout_is_read_back(tmp_path):
-    taxels = lay_taxels("sphere", (4, 3), pitch=0.002, radius=0.01)
+    taxels = lay_taxels((4, 3), pitch=0.002, radius=0.01)
     path = write_layout(tmp_path / "taxels.csv", {"a": taxels, "b": taxels[::-1]}, (4, 3))
     np.testing.assert_allclose(read_taxels(path, ("b", "a"), (4, 3)), [taxels[::-1], taxels], atol=1e-6)
 

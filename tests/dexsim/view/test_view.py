@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import os
 import shutil
 import subprocess
 import sys
@@ -15,14 +14,35 @@ import pytest
 
 from dexsim.core.assets import asset_path
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.mjcf import hand_poses
 from dexsim.objects.config import KINDS
-from dexsim.render.picture import hand_poses
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
-from dexsim.view.simulation import NONE, PolicyShelf, Simulation
+from dexsim.view.simulation import NONE, Simulation, find_policies
 from dexsim_ppo import load_policy
 
-VALUES = {"policy": "grasp", "object": "any", "command": 0.5, "friction factor": 1.0, "push [m/s]": 0.0, "push": False}
+
+class Gui(dict):
+    """Controls by their names, without a page."""
+
+    def add_slider(self, name, *, initial_value, **limits):
+        self[name] = SimpleNamespace(value=initial_value, **limits)
+        return self[name]
+
+    def add_dropdown(self, name, options):
+        self[name] = SimpleNamespace(value=options[0], options=options)
+        return self[name]
+
+    def add_button(self, name):
+        self[name] = SimpleNamespace(value=False)
+        return self[name]
+
+
+def open_with_controls(**arguments):
+    """A source and its controls."""
+    source, gui = open_source(ViewArguments(**arguments)), Gui()
+    source.add_controls(gui)
+    return source, gui
 
 
 # --- what is drawn --------------------------------------------------------------------------------------
@@ -43,22 +63,16 @@ def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
 # --- policies -------------------------------------------------------------------------------------------
 
 
-def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_path):
+def test_policies_are_listed_where_they_fit(tmp_path):
     grasp = load_policy("grasp")
     env = SimpleNamespace(observation_layout={"actor": grasp.observation_layout})
-    shelf = PolicyShelf(env, "grasp", tmp_path)
-    assert shelf.names() == ("grasp", NONE) and shelf.get(NONE) is None
-    for run, policy in (("mine", grasp), ("other", load_policy("rotate"))):
+    for run, policy in (("mine", grasp), ("other", load_policy("rotate")), ("half", grasp)):
         (tmp_path / run).mkdir()
         policy.save(tmp_path / run / "last.msgpack")
-    file = tmp_path / "mine" / "last.msgpack"
-    assert shelf.names() == ("grasp", str(file), NONE), "the policy of another observation is not offered"
-    assert shelf.get(str(file)).training == grasp.training
-    dataclasses.replace(grasp, training={"steps": 1}).save(file)
-    os.utime(file, (time.time() - 5,) * 2)  # also where the clock of the file system is coarse
-    assert shelf.get(str(file)).training == {"steps": 1}
-    file.write_bytes(b"half a file")
-    assert shelf.get(str(file)).training == {"steps": 1}, "a damaged file keeps the last sound policy"
+    (tmp_path / "half" / "last.msgpack").write_bytes(b"half a file")
+    policies = find_policies(env, "grasp", tmp_path)
+    assert list(policies) == ["grasp", str(tmp_path / "mine" / "last.msgpack"), NONE] and policies[NONE] is None
+    assert list(find_policies(env, NONE, tmp_path / "mine")) == [NONE, "grasp"], "begins with the one that is asked for"
 
 
 # --- sources --------------------------------------------------------------------------------------------
@@ -66,42 +80,50 @@ def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_
 
 @pytest.fixture(scope="module")
 def simulation(grasp_env):
-    return Simulation(grasp_env, PolicyShelf(grasp_env, "grasp"), seed=3)
+    source = Simulation(grasp_env, find_policies(grasp_env, "grasp"), seed=3)
+    source.gui = Gui()
+    source.add_controls(source.gui)
+    return source
 
 
-def run(source, ticks, **values):
-    return [source.step(VALUES | values) for _ in range(ticks)]
+def start(simulation, **values):
+    for name, value in ({"policy": "grasp", "object": "any", "friction factor": 1.0} | values).items():
+        simulation.gui[name].value = value
+    return simulation.reset()
 
 
 def test_the_object_is_the_one_asked_for(simulation):
     for kind in ("cylinder", "sphere"):
-        frame = simulation.reset(VALUES | {"object": kind})
+        frame = start(simulation, object=kind)
         assert KINDS[int(simulation._state.episode.object.shape_index)] == kind
         assert "box" not in [frame.kinds[k] for k in np.flatnonzero(frame.snapshot.primitive_active)]
 
 
 def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simulation, monkeypatch):
-    simulation.reset(VALUES)
+    start(simulation)
     # Away from the hand, where no finger is in the way: the push is there in full.
     begun = simulation._state.physics
     away = begun.qpos.at[simulation.env.physics.object_qpos[0]].add(0.2)
-    moved = dataclasses.replace(simulation._state, physics=dataclasses.replace(begun, qpos=away))
-    monkeypatch.setattr(simulation, "_state", moved)
+    state = dataclasses.replace(simulation._state, physics=dataclasses.replace(begun, qpos=away))
     monkeypatch.setattr(simulation, "_random", SimpleNamespace(normal=lambda size: np.array([0.3, 0.0, 0.0])))
-    before, state = simulation._state.episode.object.friction, simulation._state
-    speed = []
+    before, gui, speed = state.episode.object.friction, simulation.gui, []
+    gui["push [m/s]"].value, gui["friction factor"].value = 2.0, 0.5
     for push in (False, True):
-        simulation._state = state
-        run(simulation, 1, push=push, **{"push [m/s]": 2.0, "friction factor": 0.5})
+        simulation._state, gui["push"].value = state, push
+        simulation.step()
         speed.append(np.asarray(simulation._state.physics.qvel[simulation.env.physics.object_dof[:3]]))
     np.testing.assert_allclose(speed[1] - speed[0], [2.0, 0, 0], atol=0.1)
-    run(simulation, 2, **{"friction factor": 0.5})
+    assert not gui["push"].value, "a click counts once"
+    simulation.step()
     assert float(simulation._state.episode.object.friction) == pytest.approx(0.5 * float(before), rel=1e-5)
 
 
 def test_a_dropped_object_is_seen_and_then_replaced(simulation):
-    simulation.reset(VALUES)
-    frames = run(simulation, 120, policy=NONE, **{"push [m/s]": 2.0, "push": True})
+    start(simulation, policy=NONE, **{"push [m/s]": 2.0})
+    frames = []
+    for _ in range(120):
+        simulation.gui["push"].value = True
+        frames.append(simulation.step())
     notes = [frame.note for frame in frames]
     first = notes.index("dropped")
     seconds = [float(frame.snapshot.seconds) for frame in frames]
@@ -113,15 +135,15 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
 def test_the_emulated_hand_is_a_source(hand, monkeypatch):
     # The flags that other tests compile with stay as they are.
     monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
-    source = open_source(ViewArguments(what="rotate", emulated=True))
-    assert source.controls() == {}
-    frames = [source.reset({}), *(source.step({}) for _ in range(30))]
+    source, gui = open_with_controls(what="rotate", emulated=True)
+    assert not gui
+    frames = [source.reset(), *(source.step() for _ in range(30))]
     snapshot = frames[-1].snapshot
     assert frames[0].kinds == ("box",) and frames[-1].note == "trial 0" and snapshot.turns >= 0
     assert np.linalg.norm(snapshot.object_position - [0.047, 0.024, 0.088]) < 0.05
     moved = np.ptp([frame.snapshot.joint_position for frame in frames], 0)
     assert moved.max() > 0.1 and np.all(snapshot.joint_position > hand.joint_lower - 0.1)
-    assert source.reset({}).note == "trial 1"
+    assert source.reset().note == "trial 1"
 
 
 def test_a_log_is_a_source(tmp_path, monkeypatch):
@@ -135,12 +157,13 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
     with FollowingHand() as peer:
         assert runner.main(arguments(peer, tmp_path, "--seconds", "0.6")) == 0
     ticks = records(tmp_path, Kind.TICK)
-    source = open_source(ViewArguments(what=str(tmp_path / "run.log")))
-    frames = [source.reset({"go to [s]": 0.0}), *(source.step({"go to [s]": 0.0}) for _ in ticks[1:])]
+    source, gui = open_with_controls(what=str(tmp_path / "run.log"))
+    frames = [source.reset(), *(source.step() for _ in ticks[1:])]
     for frame, tick in zip(frames, ticks, strict=True):
         np.testing.assert_array_equal(frame.snapshot.joint_position, tick["readings"]["joint_position"])
-    assert frames[0].kinds == () and source.controls()["go to [s]"].high == pytest.approx(0.6, abs=0.2)
-    late = source.reset({"go to [s]": 0.3}).snapshot
+    assert frames[0].kinds == () and gui["go to [s]"].max == pytest.approx(0.6, abs=0.2)
+    gui["go to [s]"].value = 0.3
+    late = source.reset().snapshot
     assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
 
 
@@ -167,7 +190,7 @@ from dexsim.view import __main__ as demo, viewer
 class Page(viewer.Viewer):
     def run(self):
         ticks = sum(len(episode.seconds) for episode in self.source._episodes)
-        frames = [self.source.reset({{}}), *(self.source.step({{}}) for _ in range(ticks - 1))]
+        frames = [self.source.reset(), *(self.source.step() for _ in range(ticks - 1))]
         for frame in frames[::100]:
             self._read_out_at = 0.0
             self._show(frame)
