@@ -101,6 +101,8 @@ def test_the_object_is_the_one_asked_for(simulation):
 
 def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simulation, monkeypatch):
     start(simulation)
+    for _ in range(20):  # Until the object is let go.
+        simulation.step()
     # Away from the hand, where no finger is in the way: the push is there in full.
     begun = simulation._state.physics
     away = begun.qpos.at[simulation.env.physics.object_qpos[0]].add(0.2)
