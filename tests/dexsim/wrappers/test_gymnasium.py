@@ -85,17 +85,17 @@ def test_seeds_repeat_are_each_environments_own_and_without_one_the_numbers_go_o
     np.testing.assert_array_equal(single.reset(seed=5)[0], first[0])
 
 
-def test_gymnasiums_checker_accepts_a_single_environment(simple_env):
+def test_gymnasiums_checker_accepts_a_single_environment(grasp_env):
     with pytest.warns(UserWarning, match="infinity|spec"):  # of the bounds of an observation in SI units
-        check_env(GymEnv(simple_env))
+        check_env(GymEnv(grasp_env))
 
 
-def test_a_batch_is_drawn_as_one_picture_each(simple_env):
-    env = GymVectorEnv(simple_env, 2, render_mode="rgb_array")
+def test_a_batch_is_drawn_as_one_picture_each(grasp_env):
+    env = GymVectorEnv(grasp_env, 2, render_mode="rgb_array")
     env.reset(seed=0)
     first, second = env.render()
     assert first.shape == second.shape == (480, 640, 3) and first.dtype == np.uint8 and np.any(first != second)
-    single = GymEnv(simple_env)
+    single = GymEnv(grasp_env)
     assert single.render() is None
     single._batch = env
     np.testing.assert_array_equal(single.render(), first)

@@ -88,7 +88,7 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
 def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path, task):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
     entry = TRAINED[task]
-    rules = entry.task(dataclasses.replace(entry.config(), pool_size=64), hand)
+    rules = entry.task(dataclasses.replace(entry.config(), pool_size=32), hand)
     starts, place = rules.make_pool(jax.random.key(0)).qpos[:, 12:15], start_of(hand, task).place
     assert np.all(np.abs(starts.mean(0)[-len(place) :] - place) < 0.6 * starts.std(0)[-len(place) :])
 
