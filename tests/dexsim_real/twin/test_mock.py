@@ -23,10 +23,7 @@ MOCK = "sdk:dexsim_real.twin.mock"
 
 def bench_of(name, measures=WITHOUT):
     hand = load_hand(name)
-    driver = MockHand(EmulatedHand(hand, "grasp", kind="nominal"), measures)
-    bench = DriverBench(hand, driver)
-    driver._clock = bench.clock
-    return bench
+    return DriverBench(hand, MockHand(EmulatedHand(hand, "grasp", kind="nominal"), measures))
 
 
 def test_an_object_that_is_let_go_over_the_hand_is_felt():

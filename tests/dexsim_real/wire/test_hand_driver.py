@@ -82,7 +82,7 @@ FAULTS = {
 }
 
 
-def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
+def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound(monkeypatch):
     plan = [fault for fault in FAULTS for _ in range(2)]
 
     def answer(index, block, state):
@@ -91,22 +91,23 @@ def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
             return None
         return plan[index // 2](state.copy(), peer.whole())
 
-    with PtyHand(answer) as peer:
-        port = SerialHand(peer.port, QUICK)
-        port.connect()
-        before = outcomes(port.counts)
-        expected = dict.fromkeys(before, 0)
-        for index, fault in enumerate(plan):
-            assert port.exchange(command()) is None, index
-            reply = port.exchange(command())
-            assert reply is not None and reply.state["joint"]["position"][0] == 2 * index + 2, index
-            expected[FAULTS[fault]] += 1
-            expected["answered"] += 1
-        after = outcomes(port.counts)
-        assert {name: after[name] - before[name] for name in after} == expected
-        assert port.counts.sent == sum(after.values())
-        assert port.counts.crc_errors == 2  # The flips; a cut frame never gets as far as its checksum.
-        port.close()
+    peer = PtyHand(answer)
+    memory_line.connect(monkeypatch, peer, memory_line.Clock())
+    port = SerialHand("loop://", QUICK)
+    port.connect()
+    before = outcomes(port.counts)
+    expected = dict.fromkeys(before, 0)
+    for index, fault in enumerate(plan):
+        assert port.exchange(command()) is None, index
+        reply = port.exchange(command())
+        assert reply is not None and reply.state["joint"]["position"][0] == 2 * index + 2, index
+        expected[FAULTS[fault]] += 1
+        expected["answered"] += 1
+    after = outcomes(port.counts)
+    assert {name: after[name] - before[name] for name in after} == expected
+    assert port.counts.sent == sum(after.values())
+    assert port.counts.crc_errors == 2  # The flips; a cut frame never gets as far as its checksum.
+    port.close()
 
 
 def test_a_late_answer_is_thrown_away(monkeypatch):
