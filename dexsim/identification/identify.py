@@ -105,25 +105,33 @@ def identify(
         check_log(recording)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
-    (_, theta, starts), latency, fitted = search.best, search.latency, search.names
-    residual = search.residual(theta, starts)
+    latency, count = search.latency, search.count
+    fitted = search.names[:count]
+    theta, low, high = (part[:count] for part in (search.theta, search.low, search.high))
+    residual = search.residual(search.theta, search.starts)
     rmse = search.noise[0] * np.sqrt(np.mean(residual[: len(log.position)] ** 2))
     first = {name: float(value) for name, value in search.fixed.items()}
-    values = first | dict(zip(fitted, theta.tolist(), strict=True)) | {"start": float(starts[0])}
-    size, count = np.maximum(np.abs(theta), search.typical), len(theta)  # what counts as a relative change of 1
-    sizes = np.append(size, np.full(len(starts), 0.05))
-    half, correlation, null = uncertainty(search.jacobian(theta, starts), residual, sizes, search.segment)
+    values = first | dict(zip(search.names, search.theta.tolist(), strict=True)) | {"start": float(search.starts[0])}
+    size = np.maximum(np.abs(theta), search.typical[:count])  # what counts as a relative change of 1
+    jacobian = search.jacobian(search.theta, search.starts)
+    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
+    sizes = np.append(size, np.full(len(search.starts), 0.05))
+    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
+    least, largest = (part[:count] for part in search.plausible())
+    if dead_band is not None:
+        ends = search.dead_band_profile(dead_band)
+        least[-1], largest[-1] = min(ends[0], least[-1]), max(ends[1], largest[-1])
     # What was seen to fit as well farther off widens what the curvature says.
-    least, largest = search.plausible()
-    least = np.minimum(theta - half, least).clip(search.low)
-    largest = np.maximum(theta + half, largest).clip(None, search.high)
+    least, largest = np.minimum(theta - half, least).clip(low), np.maximum(theta + half, largest).clip(None, high)
     vague = np.maximum(half, (largest - least) / 2) > _NORMAL * _VAGUE * size
     unidentifiable = _groups(fitted, [members[:count] for members in null], correlation, vague)
     margin = 1e-3 * size
-    at_bound = tuple(np.array(fitted)[(theta <= search.low + margin) | (theta >= search.high - margin)].tolist())
-    # With the weights found last: costs under other weights cannot be compared.
-    cost = search.costs_by_latency(sorted(latencies), 10)
+    at_bound = tuple(np.array(fitted)[(theta <= low + margin) | (theta >= high - margin)].tolist())
+    # All from the solution and with the weights found last: costs under other weights cannot be compared.
+    cost = {}
+    for search.latency in sorted(latencies):
+        cost[search.latency] = search.solve(search.theta, 10)[0]
     limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")

@@ -1,91 +1,81 @@
 """The search of an identification: one log's least squares.
 
 Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops without
-gradient: a scan over latency (a whole number), restarts from other dead-bands and parameters, and a cross-entropy
-search, as a dead-band makes the cost rugged.
+gradient: scans over latency (a whole number) and dead-band (a threshold), and a cross-entropy search, as a dead-band
+makes the cost rugged.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from dexsim.core.errors import CalibrationError
+from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 
 _BLUR = 2e-3  # rad, width of the dead-band's edges in the gradient
 CHI2 = 3.84  # 95 %, one parameter
 _THRESHOLD = 7.35  # 95 % for a threshold (Hansen 2000): the likelihood has a kink there
 _NOISE = (0.002, 0.02)  # rad, Nm: weights of angle and torque to begin with
-_WIDTHS = 7  # dead-bands that the search begins from
-_REACH, _START = 0.05, 0.01  # rad that a start may be off the angle that was read; its scale
-_CROWD = 256  # candidates of a round of the cross-entropy search
 
 # In the order of the arrays below: whatever is fitted, the compiled programs are the same.
 _NAMES = tuple(PARAMETERS)
 
 
-class _Data(NamedTuple):
-    """A log on the device."""
+@pytree_dataclass
+class _Data:
+    """A log on the device; C channels: the angle, and the torque if it was recorded."""
 
     target: jax.Array  # [T] rad
-    measured: jax.Array  # [2, T] rad and Nm; where no torque was recorded, anything
+    measured: jax.Array  # [C, T] rad, Nm
     segment: jax.Array  # [T]
     timestep: jax.Array  # s
+    substeps: int = static()
 
 
-@functools.partial(jax.jit, static_argnames=("substeps", "blur"))
-def _readings(
-    data: _Data, substeps: int, values: jax.Array, starts: jax.Array, latency: jax.Array, blur: float = 0.0
-) -> jax.Array:
-    """[2, T] angle and torque, from all parameters and each sample's segment's start [T]."""
+@functools.partial(jax.jit, static_argnames="blur")
+def _readings(data: _Data, values: jax.Array, starts: jax.Array, latency: jax.Array, blur: float = 0.0) -> jax.Array:
+    """[C, T] angle and torque, from all parameters and each sample's segment's start [T]."""
     named = dict(zip(_NAMES, values, strict=True)) | {"start": starts}
-    return jnp.stack(simulate(named, data.target, latency, data.timestep, substeps, data.segment, blur))
+    out = simulate(named, data.target, latency, data.timestep, data.substeps, data.segment, blur)
+    return jnp.stack(out[: len(data.measured)])
 
 
-@functools.partial(jax.jit, static_argnames="substeps")
-def _slopes(data: _Data, substeps: int, values: jax.Array, starts: jax.Array, latency: jax.Array) -> jax.Array:
-    """[2, T, P + 1] derivatives of `_readings` by all parameters and by the segment's start.
+@jax.jit
+def _slopes(data: _Data, values: jax.Array, starts: jax.Array, latency: jax.Array) -> jax.Array:
+    """[C, T, P + 1] derivatives of `_readings` by all parameters and by the segment's start.
 
     The dead-band's edges are blurred: the exact gradient does not see that a parameter moves the
     instant at which the torque switches.
     """
 
     def blurred(values: jax.Array, shift: jax.Array) -> jax.Array:
-        return _readings(data, substeps, values, starts + shift, latency, blur=_BLUR)
+        return _readings(data, values, starts + shift, latency, blur=_BLUR)
 
     by_value, by_start = jax.jacfwd(blurred, (0, 1))(values, jnp.zeros(()))
     return jnp.concatenate([by_value, by_start[..., None]], -1)
 
 
-@functools.partial(jax.jit, static_argnames="substeps")
-def _crowd_costs(
-    data: _Data, substeps: int, crowd: jax.Array, starts: jax.Array, latency: jax.Array, weight: jax.Array
-) -> jax.Array:
+@jax.jit
+def _crowd_costs(data: _Data, crowd: jax.Array, starts: jax.Array, latency: jax.Array, weight: jax.Array) -> jax.Array:
     """Weighted sums of squares [N] for parameters [N, P]."""
 
     def cost(values: jax.Array) -> jax.Array:
-        error = _readings(data, substeps, values, starts, latency) - data.measured
+        error = _readings(data, values, starts, latency) - data.measured
         return jnp.sum((error * weight[:, None]) ** 2)
 
     return jax.vmap(cost)(crowd)
 
 
-class Fit(NamedTuple):
-    """What was reached: the weighted sum of squares, the fitted parameters [P], and the true angle [S] rad at the begin
-    of each segment."""
-
-    cost: float
-    theta: np.ndarray
-    starts: np.ndarray
-
-
 class Search:
-    """One log's least squares. The arguments are those of `identify`, the log is checked.
+    """One log's least squares: theta [P] (what is fitted, the dead-band last), the starts [S], and the latency.
+
+    The arguments are those of `identify`, the log is checked.
 
     Raises:
       CalibrationError: a name that cannot be fitted, or a first guess out of its bounds.
@@ -103,85 +93,98 @@ class Search:
         for name in fit:
             if name not in names:
                 raise CalibrationError(f"cannot fit {name!r}: choose from {', '.join(names)}")
-        bounds = {name: (PARAMETERS[name].low, PARAMETERS[name].high) for name in fit}
-        if dead_band is not None:
-            bounds["dead_band"] = dead_band
-        self.names, self.dead_band, self.fixed = tuple(bounds), dead_band, with_defaults(dict(start), log)
-        self.low, self.high = np.array(list(bounds.values())).T
-        begin = np.array([float(self.fixed[name]) for name in bounds])
-        for value, (name, (low, high)) in zip(begin, bounds.items(), strict=True):
+        self.log, self.dead_band = log, dead_band
+        self.fixed = with_defaults(dict(start), log)
+        self.segment, angle = segments(log)
+        self.names = (*dict.fromkeys(fit), "dead_band")
+        self.count = len(self.names) - (dead_band is None)
+        """Parameters that are fitted in the end."""
+        parameters = [PARAMETERS[name] for name in self.names]
+        self.low, self.high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
+        self.low[-1], self.high[-1] = dead_band or (self.low[-1], self.high[-1])
+        self.typical = np.array([p.typical for p in parameters])
+        begin = np.array([float(self.fixed[name]) for name in self.names])
+        for name, value, low, high in zip(self.names, begin, self.low, self.high, strict=True):
             if not low <= value <= high:
                 raise CalibrationError(
                     f"{log.name}: {name} starts at {value:g}, outside its bounds {low:g} to {high:g}"
                 )
-        self.segment, angle = segments(log)
-        self._index = np.array([_NAMES.index(name) for name in bounds])
+        self._index = np.array([_NAMES.index(name) for name in self.names])
         self._values = np.array([float(self.fixed[name]) for name in _NAMES])
-        self.typical = np.array([PARAMETERS[name].typical for name in bounds])
-        self._scale = np.maximum(np.abs(begin), self.typical)
+        self.scale = np.maximum(np.abs(begin), self.typical)
         # From a bound, where a friction's gradient may vanish, the search would not set off.
-        inside = 0.05 * np.minimum(self._scale, self.high - self.low)
-        self._rests = angle - float(self.fixed["encoder_bias"])
-        self.best = Fit(np.inf, np.clip(begin, self.low + inside, self.high - inside), self._rests)
+        inside = 0.05 * np.minimum(self.scale, self.high - self.low)
+        self.theta = np.clip(begin, self.low + inside, self.high - inside)
+        self.theta[-1] = begin[-1]
+        self.starts = self._rests = angle - float(self.fixed["encoder_bias"])
         self.measured = np.stack([log.position] if log.torque is None else [log.position, log.torque])
         self.noise = np.array(_NOISE)[: len(self.measured)]
-        self.timestep, self.latency, self._substeps = log.period / substeps, 0, substeps
+        self.timestep, self.latency, self.best = log.period / substeps, 0, np.inf
         self._seen: list[tuple[np.ndarray, np.ndarray]] = []  # candidates and their costs
         self._data = _Data(
             jnp.asarray(log.target, jnp.float32),
-            jnp.asarray(self.measured[[0, -1]], jnp.float32),
+            jnp.asarray(self.measured, jnp.float32),
             jnp.asarray(self.segment),
             jnp.float32(self.timestep),
+            substeps,
         )
 
     def run(self, latencies: tuple[int, ...]) -> None:
         """Fit once with the given weights, and once with those found."""
-        if self.dead_band is not None:
-            self._scan_latencies(latencies)
-            for width in np.linspace(*self.dead_band, _WIDTHS):
-                self._attempt(np.append(self.best.theta[:-1], width), 15)
-        for last in (False, True):
-            self._scan_latencies(latencies)
-            self._settle(last)
+        self._scan_latencies(latencies)
+        for fine in (False, True):
+            if self.dead_band is not None:
+                self._search_dead_band(self.dead_band, fine)
+            self._scan_latencies(tuple(lag for lag in latencies if abs(lag - self.latency) <= 1))
+            self._settle(last=fine)
 
     # --- the inner loop ---------------------------------------------------------------------------
 
     def residual(self, theta: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Weighted residuals [C * T] of the C channels: the angle, and the torque if it was recorded."""
-        error = self._call(_readings, theta, starts)[: len(self.noise)] - self.measured
+        """Weighted residuals [C * T]."""
+        error = self._call(_readings, theta, starts) - self.measured
         return (error / self.noise[:, None]).ravel()
 
     def jacobian(self, theta: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """Of `residual`, [C * T, P + S], in the parameters' own units."""
-        slope = self._call(_slopes, theta, starts)[: len(self.noise)] / self.noise[:, None, None]
+        slope = self._call(_slopes, theta, starts) / self.noise[:, None, None]
         own = slope[..., -1:] * (self.segment[:, None] == np.arange(len(starts)))
         slope = np.concatenate([slope[..., self._index], own], -1)
         return slope.reshape(-1, slope.shape[-1])
 
-    def solve(self, theta: np.ndarray, starts: np.ndarray, evaluations: int) -> Fit:
-        """The fit by gradient from here."""
-        scale, count = np.append(self._scale, np.full(len(starts), _START)), len(theta)
-        bounds = np.append(self.low, starts - _REACH) / scale, np.append(self.high, starts + _REACH) / scale
+    def solve(
+        self, theta: np.ndarray, evaluations: int, with_band: bool = False
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Sum of squares, theta and starts of the fit by gradient; the dead-band stays unless asked."""
+        count, parts = len(theta) - (not with_band), len(self.starts)
+        scale = np.concatenate([self.scale[:count], np.full(parts, 0.01)])
+        reach = 0.05  # rad that a start may be off the angle that was read
+        low = np.concatenate([self.low[:count], self.starts - reach]) / scale
+        high = np.concatenate([self.high[:count], self.starts + reach]) / scale
+        columns = np.r_[np.arange(count), np.arange(len(theta), len(theta) + parts)]
 
         def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return x[:count] * scale[:count], x[count:] * _START
+            return np.concatenate([x[:count] * scale[:count], theta[count:]]), x[count:] * 0.01
 
         result = least_squares(
             lambda x: self.residual(*split(x)),
-            np.append(theta, starts) / scale,
-            jac=lambda x: self.jacobian(*split(x)) * scale,
-            bounds=bounds,
+            np.concatenate([theta[:count], self.starts]) / scale,
+            jac=lambda x: self.jacobian(*split(x))[:, columns] * scale,
+            bounds=(low, high),
+            method="trf",
             xtol=1e-6,
             ftol=1e-7,
             gtol=1e-10,
             max_nfev=evaluations,
         )
-        return Fit(2.0 * float(result.cost), *split(result.x))
+        return 2.0 * float(result.cost), *split(result.x)
 
-    def _attempt(self, theta: np.ndarray, evaluations: int, starts: np.ndarray | None = None) -> None:
-        """Solve from here; keep what is reached if it is the best."""
-        reached = self.solve(theta, self.best.starts if starts is None else starts, evaluations)
-        self.best = min(self.best, reached, key=lambda fit: fit.cost)
+    def _attempt(self, theta: np.ndarray, evaluations: int, with_band: bool = False) -> float:
+        """Sum of squares that is reached from here; keeps the solution if it is the best."""
+        cost, theta, starts = self.solve(theta, evaluations, with_band)
+        if cost < self.best:
+            self.best, self.theta, self.starts = cost, theta, starts
+        return cost
 
     def _call(
         self, function: Callable[..., jax.Array], theta: np.ndarray, starts: np.ndarray, *more: Any, far: float = 1e3
@@ -189,74 +192,116 @@ class Search:
         """`function` of the log, of all parameters [..., len(_NAMES)] from the fitted ones [..., P], and the starts."""
         values = np.broadcast_to(self._values, (*theta.shape[:-1], len(_NAMES))).copy()
         values[..., self._index] = theta
-        arrays = jnp.asarray(values, jnp.float32), jnp.asarray(starts[self.segment], jnp.float32)
-        out = function(self._data, self._substeps, *arrays, jnp.int32(self.latency), *more)
+        by_sample = jnp.asarray(starts[self.segment], jnp.float32)
+        out = function(self._data, jnp.asarray(values, jnp.float32), by_sample, jnp.int32(self.latency), *more)
         return np.nan_to_num(np.asarray(out, float), nan=far, posinf=far, neginf=-far)
 
     # --- the outer loops --------------------------------------------------------------------------
 
-    def costs_by_latency(self, latencies: Sequence[int], evaluations: int) -> dict[int, float]:
-        """The sum of squares of each latency, all solved from the present solution."""
-        now, costs = self.latency, {}
-        for self.latency in latencies:
-            costs[self.latency] = self.solve(*self.best[1:], evaluations).cost
-        self.latency = now
-        return costs
-
-    def _scan_latencies(self, latencies: tuple[int, ...]) -> None:
-        costs = self.costs_by_latency(latencies, 6) if len(latencies) > 1 else dict.fromkeys(latencies, 0.0)
+    def _scan_latencies(self, candidates: tuple[int, ...]) -> None:
+        self.best, costs = np.inf, {}
+        for self.latency in candidates:
+            costs[self.latency] = self._attempt(self.theta, 6)
         self.latency = min(costs, key=costs.__getitem__)
-        self.best = self.best._replace(cost=np.inf)  # that of another latency
+
+    def _search_dead_band(self, span: tuple[float, float], fine: bool) -> None:
+        """Scan the range, or five values about the present one, then Brent's method."""
+        cell = (span[1] - span[0]) / 10
+        near = np.clip(self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
+        grid = near if fine else np.linspace(*span, 11)
+        self.best = np.inf
+
+        def cost(width: float) -> float:
+            return self._attempt(np.append(self.theta[:-1], width), 5)
+
+        at = int(np.argmin([cost(width) for width in grid]))
+        minimize_scalar(
+            cost,
+            method="bounded",
+            bounds=(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]),
+            options={"xatol": 2e-3 * (span[1] - span[0])},
+        )
 
     def _settle(self, last: bool) -> None:
         """Solve to the end, and take each channel's noise from what the fit leaves."""
-        rugged = self.dead_band is not None  # else there is next to nothing to get lost in
-        self._attempt(self.best.theta, 30)
-        self._start_over(tries=8 if rugged else 2 * last)
-        if rugged and not last:
+        self.best, with_band = np.inf, self.dead_band is not None
+        self._attempt(self.theta, 30)
+        if with_band:
+            self._attempt(self.theta, 30, with_band=True)
+        # Without a dead-band there is next to nothing to get lost in.
+        self._start_over(tries=(6 if last else 10) if with_band else 2)
+        if with_band and not last:
             self._explore(rounds=6)
-        left = self.residual(*self.best[1:]).reshape(self.measured.shape)
+        left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
         self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
-        self.best = self.best._replace(cost=np.sum(self.residual(*self.best[1:]) ** 2))
         if last:
-            self._explore(rounds=14 if rugged else 3)
+            self.best = np.sum(self.residual(self.theta, self.starts) ** 2)
+            self._explore(rounds=14 if with_band else 3)
 
     def _start_over(self, tries: int) -> None:
         """Solve again from about the present parameters and from the angles as they were read: a valley to which both
         have settled together has no other way out."""
-        rng = np.random.default_rng(1)
+        rng, best, starts = np.random.default_rng(1), self.theta, self.starts
         for index in range(tries):
             width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
-            theta = self.best.theta + width * self._scale * rng.standard_normal(len(self._scale))
-            self._attempt(np.clip(theta, self.low, self.high), 12, self._rests)
+            theta = best + width * self.scale * rng.standard_normal(len(best))
+            theta[self.count :] = best[self.count :]
+            self.starts = self._rests
+            result = self.solve(np.clip(theta, self.low, self.high), 12, self.dead_band is not None)
+            if result[0] < self.best:
+                self.best, best, starts = result
+        self.theta, self.starts = best, starts
 
-    def _explore(self, rounds: int) -> None:
+    def _explore(self, rounds: int, crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
         dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
-        scale, count = self._scale, len(self._scale)
-        slope = self.jacobian(*self.best[1:])[:, :count] * scale
-        middle = self.best.theta / scale
+        count, scale = self.count, self.scale[: self.count]
+        slope = self.jacobian(self.theta, self.starts)[:, :count] * scale
+        middle = self.theta[:count] / scale
         spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
-        rng, weight = np.random.default_rng(0), np.append(1.0 / self.noise, 0.0)[:2].astype(np.float32)
+        rng, weight = np.random.default_rng(0), 1.0 / jnp.asarray(self.noise, jnp.float32)
         self._seen = []
         for _ in range(rounds):
-            tries = rng.multivariate_normal(middle, spread, _CROWD)
+            tries = rng.multivariate_normal(middle, spread, crowd)
+            tries = np.clip(tries, self.low[:count] / scale, self.high[:count] / scale)
             tries[: 2 * count + 1] = middle
             for end, bound in enumerate((self.low, self.high)):  # Where a limit binds hardly ever, curvature misleads.
-                tries[1 + end * count :][range(count), range(count)] = bound / scale
-            tries = np.clip(tries, self.low / scale, self.high / scale)
-            costs = self._call(_crowd_costs, tries * scale, self.best.starts, weight, far=np.inf)
-            self._seen.append((tries * scale, costs))
-            elite, before = tries[np.argsort(costs)[: _CROWD // 8]], self.best
-            self._attempt(elite[0] * scale, 6)
-            middle = elite[0] if self.best is before else self.best.theta / scale
-            spread = 2.0 * np.cov(elite.T).reshape(count, count) + 1e-12 * np.eye(count)
+                tries[1 + end * count :][range(count), range(count)] = bound[:count] / scale
+            thetas = np.tile(self.theta, (crowd, 1))
+            thetas[:, :count] = tries * scale
+            costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)
+            order = np.argsort(costs)
+            self._seen.append((thetas, costs))
+            elite = tries[order[: crowd // 8]]
+            middle, spread = elite[0], 2.0 * np.cov(elite.T) + 1e-12 * np.eye(count)
+            before = self.best
+            self._attempt(thetas[order[0]], 6, self.dead_band is not None)
+            if self.best < before:
+                middle = self.theta[:count] / scale
+
+    # --- what fits as well ------------------------------------------------------------------------
 
     def plausible(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and largest of each parameter among all candidates that the data do not exclude."""
-        least = np.sum(self.residual(*self.best[1:]) ** 2)
-        critical = CHI2 if self.dead_band is None else _THRESHOLD
-        limit = least * (1 + critical / max(self.measured.size - len(self.names), 1))
+        limit = self._limit(np.sum(self.residual(self.theta, self.starts) ** 2), self.dead_band is not None)
         thetas, costs = (np.concatenate(parts) for parts in zip(*self._seen, strict=True))
-        within = np.concatenate([thetas[costs <= limit], self.best.theta[None]])
+        within = np.concatenate([thetas[costs <= limit], self.theta[None]])
         return within.min(0), within.max(0)
+
+    def dead_band_profile(self, span: tuple[float, float]) -> tuple[float, float]:
+        """Where the sum of squares, fitted anew, rises by the critical value of a threshold."""
+        limit, ends = self._limit(self.solve(self.theta, 15)[0], True), []
+        for way, end in ((-1, span[0]), (1, span[1])):
+            step, last = 2e-3 * (span[1] - span[0]), self.theta[-1]
+            while way * (end - last) > 0:
+                tried = float(np.clip(last + way * step, *span))
+                if self.solve(np.append(self.theta[:-1], tried), 6)[0] > limit:
+                    break
+                last, step = tried, 1.6 * step
+            ends.append(float(np.clip(last + way * step, *span)))  # the first that is excluded
+        return ends[0], ends[1]
+
+    def _limit(self, least: float, threshold: bool) -> float:
+        """The largest sum of squares that the data do not exclude."""
+        freedom = max(self.measured.size - len(self.theta), 1)
+        return least * (1 + (_THRESHOLD if threshold else CHI2) / freedom)

@@ -36,8 +36,8 @@ class FollowingHand(PtyHand):
 
 def arguments(peer, folder, *more):
     """Patient with the peer, which shares this process and perhaps a busy machine."""
-    options = "--uncalibrated --yes --fixed-object --link.settle 0 --link.no-paced --link.margin 0.2 --safety.stale 1"
-    options += " --approach 0.4 --quiet --no-realtime --no-guard"
+    options = "--uncalibrated --yes --fixed-object --link.settle 0 --link.no-paced --link.margin 0.2"
+    options += " --safety.stale 1 --safety.watchdog 2 --approach 0.4 --quiet --no-realtime --no-guard"
     files = ["--log", str(folder / "run.log"), "--output", str(folder / "run.json")]
     return ["grasp", "--port", peer.port, *options.split(), *files, *more]
 

@@ -49,7 +49,7 @@ def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure)
 
     monkeypatch.setattr(Controller, "tick", tick)
     with FollowingHand() as peer:
-        options = arguments(peer, tmp_path, "--seconds", "8")
+        options = arguments(peer, tmp_path, "--seconds", "8", "--safety.watchdog", "0.08")
         if failure == "raises":
             with pytest.raises(RuntimeError, match="the policy broke"):
                 run.main(options)
