@@ -34,7 +34,7 @@ EXPECTED = {
     ),
     "own_hand": (
         4,
-        [r"(ok    .+\n){5}", r"FAIL  files load: my_hand/leap_like\.toml: .* has no site 'ring_tip'", "of 192 taxels"],
+        [r"(ok    .+\n){5}", r"FAIL  files load: my_hand/leap_like\.toml: Invalid name 'ring_tip'", "of 192 taxels"],
     ),
 }
 
