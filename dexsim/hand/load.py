@@ -7,6 +7,7 @@ import hashlib
 import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -108,13 +109,28 @@ def shipped_name(path: Path) -> str:
 
 
 def read_mjcf(path: Path) -> bytes:
-    """A file's content; an MJCF that includes others as MuJoCo writes it, with their content in their place."""
+    """A file's content; of an MJCF that includes others, with their content in its place."""
     data = path.read_bytes()
     if path.suffix != ".xml" or b"<include" not in data:
         return data
-    import mujoco
+    model = ElementTree.fromstring(data)
+    _paste_includes(model, path.parent, path.parent)
+    return ElementTree.tostring(model)
 
-    return mujoco.MjSpec.from_file(str(path)).to_xml().encode()
+
+def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
+    """MuJoCo looks beside the model first, in `top`, then beside the file that includes, in `folder`."""
+    children = []
+    for child in list(element):
+        if child.tag != "include":
+            _paste_includes(child, top, folder)
+            children.append(child)
+            continue
+        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
+        included = ElementTree.parse(file).getroot()
+        _paste_includes(included, top, file.parent)
+        children += included
+    element[:] = children
 
 
 def digest_of(*files: Path) -> str:

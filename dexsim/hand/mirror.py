@@ -81,7 +81,7 @@ def is_mirror_image(hand: Hand, other: Hand) -> bool:
     return (
         hand.side == image.side
         and hand.joint_names == tuple(swap_sides(name) for name in other.joint_names)
-        and all(np.allclose(getattr(hand, name), getattr(image, name), atol=1e-5) for name in parts)
+        and all(np.array_equal(getattr(hand, name), getattr(image, name)) for name in parts)
     )
 
 

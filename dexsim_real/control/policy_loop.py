@@ -101,7 +101,8 @@ class PolicyLoop:
         if now >= ready and self.objects.ready():
             return False
         if now > ready + _PATIENCE:
-            raise HandError("the camera does not see the object; check light, --optics.hsv-low, -high and .min-area")
+            options = "--optics.hsv-low, --optics.hsv-high, --optics.min-area"
+            raise HandError(f"the camera does not see the object; check the light, {options}")
         posture = self.controller.spec.posture if self.approach_seconds > 0 else None
         goal = self._start if posture is None else np.asarray(posture, np.float32)
         share = min((now - self._begin) / self.approach_seconds, 1.0) if self.approach_seconds > 0 else 1.0
