@@ -15,14 +15,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
-from dexsim.env.episode import EpisodeSampler
+from dexsim.core.ranges import sample_extreme
 from dexsim.env.motors import JointCommand, Motors, check_timestep
-from dexsim.env.observer import Observer
-from dexsim.env.sensors import SensorInput, SensorSuite
+from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.env.touch import TouchModel
@@ -30,8 +30,13 @@ from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import forward_kinematics
+from dexsim.objects.config import PROPERTY_RANGES
+from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
+from dexsim.randomization import sample_hand, tilted_down
+from dexsim.sensing.imu import sample_imu
+from dexsim.sensing.taxels import TaxelArray
 from dexsim.task_spec import TaskSpec, correct_readings
 
 
@@ -60,9 +65,7 @@ class Env:
         self.motors = Motors(self.physics)
         self.touch = TouchModel(config, hand)
         self.sensors = SensorSuite(config, hand, task)
-        self.observer = Observer(config, hand, task)
-        self.sampler = EpisodeSampler(config, hand, task, self.sensors)
-        self.observation_layout = self.observer.layout
+        self.observation_layout = self.sensors.layout
         self.control_period = config.physics.control_period
         """One control tick, s."""
         self.pool = task.make_pool(jax.random.key(seed))
@@ -80,7 +83,8 @@ class Env:
         """A new episode from this start state, with the task's goal or the given one: its poses and shape, with the
         object's physical properties, hand and sensors drawn by `key`."""
         key, hand_key, goal_key, noise_key, sensor_key, object_key = jax.random.split(key, 6)
-        episode = self.sampler.sample(hand_key, sensor_key, object_key, start.object, scale)
+        keys = hand_key, sensor_key, object_key
+        episode = sample_episode(self.task, self.hand, self.sensors.taxels, keys, start.object, scale)
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         joints = start.qpos[self.physics.joint_qpos]
@@ -120,7 +124,7 @@ class Env:
 
         command = self._control(state, action)
         law = self.motors.law(hand, command)
-        push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
+        push = self.task.push(push_key, episode.object) + self._tilt_force(episode)
         held, delta = self.task.held(state.goal), hand.pad_thickness_delta
         result = self.physics.advance(law, episode.object, state.physics, push, state.tip_stiffness, delta, held)
         result, finite = revert_if_diverged(result, state.physics, command.valid)
@@ -220,9 +224,8 @@ class Env:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
         now, shown = self.sensors.input(truth), self.task.goal_readings(goal)
-        before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, taxel_memory = self.sensors.read(key, episode, now, before, shown, action, last)
+        readings, taxel_memory = self.sensors.read(key, episode, now, shown, action, last)
         correction = None if last is None else last.correction
         if self.spec.force_loop:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
@@ -230,21 +233,53 @@ class Env:
             "joint_target": command.target,
             "action": command.action,
             "goal": goal,
-            "joint_torque": now.joint_torque,
-            "taxel_force": now.taxel_force,
+            "sensor_input": now,
             "readings": readings,
             "taxel_memory": taxel_memory,
             "correction": correction,
-            "obs": self.observer.observe(readings, truth, shown),
+            "obs": self.sensors.observe(readings, truth, shown),
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }
 
-    def _last_input(self, last: State) -> SensorInput:
-        """What the sensors saw in the tick that ended with this state."""
-        joints, place = last.physics.qpos[self.physics.joint_qpos], last.physics.qpos[self.physics.object_qpos]
-        quat = place[3:] / jnp.linalg.norm(place[3:])
-        return SensorInput(joints, last.joint_torque, last.taxel_force, place[:3], quat)
+    def _tilt_force(self, episode: Episode) -> jax.Array:
+        """The object's share [3] N of a tilted gravity; the links' share is small and left out."""
+        weight = float(np.linalg.norm(self.task.gravity))  # m/s^2
+        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
+        return episode.object.mass * weight * (tilted_down(down, episode.hand.tilt) - jnp.asarray(down))
+
+
+def sample_episode(
+    task: Task,
+    hand: Hand,
+    taxels: TaxelArray,
+    keys: tuple[jax.Array, jax.Array, jax.Array],
+    object: ObjectParams,
+    scale: jax.Array | None = None,
+) -> Episode:
+    """What an episode draws at its start: the hand, the object's properties, the IMU and the taxels.
+
+    Args:
+      keys: of the hand, of the sensors, and of the object's physical properties.
+      object: of the start state. Its shape stays, for the state was chosen for it; the physical properties that the
+        task draws (`Task.object_ranges`) are drawn anew.
+      scale: [] in [0, 1], narrows every range about nominal; None for 1.
+    """
+    hand_key, sensor_key, object_key = keys
+    config, ranges, period = task.config, task.config.randomization, task.config.physics.control_period
+    if drawn := tuple(name for name in PROPERTY_RANGES if f"objects.{name}" in task.object_ranges):
+        object = resample_properties(object_key, object, config.objects, task.unit_inertia(object), drawn)
+    if scale is not None:
+        object = toward_nominal(object, config.objects, task.unit_inertia(object), scale)
+    width = 1.0 if scale is None else scale
+    times = {"timestep": config.physics.timestep, "control_period": period}
+    extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
+    return Episode(
+        hand=sample_hand(hand_key, ranges, hand, **times, scale=width),
+        object=object,
+        imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
+        taxels=taxels.sample(jax.random.fold_in(sensor_key, 1), width),
+    )
 
 
 def _common_metrics(

@@ -1,7 +1,6 @@
 """Observations: sizes, order and content of every field, the ablations, and bitwise sameness."""
 
 import dataclasses
-import types
 
 import jax
 import mujoco
@@ -12,7 +11,7 @@ from random_readings import random_readings
 
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.env.observer import Observer
+from dexsim.env.sensors import SensorSuite
 from dexsim.observation import (
     FIELDS,
     GRASP,
@@ -24,6 +23,8 @@ from dexsim.observation import (
     Readings,
     layout,
 )
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
 from dexsim_real.control.controller import sources_of
 
 TIPS = ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip")
@@ -120,8 +121,8 @@ def test_ablations_leave_their_fields_out(hand, readings, truth, names, leave_ou
 def test_the_critic_keeps_what_the_actor_goes_without(hand):
     """An ablation is of the actor."""
     config = ObservationConfig(leave_out=("contact_force",), add=("last_action",))
-    task = types.SimpleNamespace(fields={"actor": GRASP, "critic": GRASP})
-    layouts = Observer(types.SimpleNamespace(observation=config), hand, task).layout
+    config = GraspConfig(observation=config)
+    layouts = SensorSuite(config, hand, Grasp(config, hand)).layout
     actor, critic = ([field.name for field in layouts[group]] for group in ("actor", "critic"))
     assert actor == [*(name for name in GRASP if name != "contact_force"), "last_action"]
     assert critic == [*GRASP, "last_action"]

@@ -27,16 +27,15 @@ from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.objects import (
+from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import (
     CLEARANCE,
     largest_size,
+    load_pool,
     lowest_point,
     sample_turned_object,
-    slots,
     solid_inertia,
 )
-from dexsim.tasks.rotate.report import summarize
-from dexsim.tasks.rotate.start import load_pool
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
@@ -124,7 +123,7 @@ class Rotate(Task):
         self.config, self.hand, self.posture = config, hand, posture
         self._placed = placed = config.placed_on(hand)
         self.turn = placed.turn
-        self.slots, self.largest = slots(config), largest_size(config)
+        self.slots, self.largest = config.objects.slots, largest_size(config)
         drawn = ("edge", "proportions", *(f"objects.{name}" for name in PROPERTY_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.

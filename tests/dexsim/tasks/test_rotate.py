@@ -24,8 +24,8 @@ from dexsim.task_spec import TurnSpec
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate import start
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, any_object, clear_of_palm, paper
-from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, solid_inertia, upright
 from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import lowest_point, sample_turned_object, solid_inertia, upright
 from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
 from dexsim.touch.taxel_force import Touch
 
