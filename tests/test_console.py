@@ -9,8 +9,7 @@ import sys
 import pytest
 from paths import ROOT
 
-from dexsim import __main__ as console
-from dexsim import catalog
+from dexsim import __main__ as console, catalog
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig

@@ -9,8 +9,7 @@ import pytest
 from shapes import solid
 
 from dexsim.hand.kinematics import HandPose, forward_kinematics, taxel_positions
-from dexsim.touch import reduce as touch_reduce
-from dexsim.touch import skin as touch_skin
+from dexsim.touch import reduce as touch_reduce, skin as touch_skin
 from dexsim.touch.skin import Skin
 from dexsim.touch.taxel_force import compute_touch, project_on_normals
 
