@@ -27,7 +27,7 @@ FLOORS = {
         ("env",),
         ("tasks",),
         ("registry",),
-        ("catalog", "wrappers"),
+        ("wrappers",),
         ("view",),
         ("check_hand",),
         ("import_hand",),
