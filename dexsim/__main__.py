@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in WITHOUT_JAX:
         require("jax", "train", f"dexsim {name}")
     if name == "train":
-        cli.announce(cli.LOADING)
+        cli.announce_loading()
     exit_on_interrupt()
     module = importlib.import_module(COMMANDS[name][0])
     restore_interrupt()

@@ -20,8 +20,7 @@ from dexsim.geometry.mirror import AXIAL, POLAR, QUAT
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
 from dexsim.hand.mirror import mirror_hand
-from dexsim.touch.estimate import ForceEstimate, estimate_force
-from dexsim.touch.reduce import reduce_touch_links
+from dexsim.touch.reduce import ForceEstimate, estimate_force, reduce_touch_links
 
 
 @pytree_dataclass

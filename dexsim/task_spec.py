@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.control import Control
+from dexsim.control import Control, correct_command
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
-from dexsim.force_loop import correct_command
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings
-from dexsim.touch.estimate import estimate_force
+from dexsim.touch.reduce import estimate_force
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 
 if __name__ == "__main__":
-    cli.announce(cli.LOADING)
+    cli.announce_loading()
 
 import dexsim
 from dexsim.core.compilation import make_deterministic

@@ -17,7 +17,7 @@ FLOORS = {
     "dexsim": (
         ("core",),
         ("errors",),
-        ("geometry", "actuator", "force_loop"),
+        ("geometry", "actuator"),
         ("hand",),
         ("objects", "control", "randomization", "touch"),
         ("sensing", "render", "calibration", "observation"),

@@ -22,7 +22,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
 from dexsim.core.ranges import sample_extreme
 from dexsim.env.motors import JointCommand, Motors, check_timestep
-from dexsim.env.sensors import SensorSuite
+from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.env.touch import TouchModel
@@ -224,8 +224,9 @@ class Env:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
         now, shown = self.sensors.input(truth), self.task.goal_readings(goal)
+        before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, taxel_memory = self.sensors.read(key, episode, now, shown, action, last)
+        readings, taxel_memory = self.sensors.read(key, episode, now, before, shown, action, last)
         correction = None if last is None else last.correction
         if self.spec.force_loop:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
@@ -233,7 +234,8 @@ class Env:
             "joint_target": command.target,
             "action": command.action,
             "goal": goal,
-            "sensor_input": now,
+            "joint_torque": now.joint_torque,
+            "taxel_force": now.taxel_force,
             "readings": readings,
             "taxel_memory": taxel_memory,
             "correction": correction,
@@ -241,6 +243,12 @@ class Env:
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }
+
+    def _last_input(self, last: State) -> SensorInput:
+        """What the sensors saw in the tick that ended with this state."""
+        joints, place = last.physics.qpos[self.physics.joint_qpos], last.physics.qpos[self.physics.object_qpos]
+        quat = place[3:] / jnp.linalg.norm(place[3:])
+        return SensorInput(joints, last.joint_torque, last.taxel_force, place[:3], quat)
 
     def _tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""

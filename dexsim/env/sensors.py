@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim import observation
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
-from dexsim.env.state import Episode, SensorInput, State
+from dexsim.env.state import Episode, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
@@ -16,6 +17,17 @@ from dexsim.observation import Motion, Readings
 from dexsim.randomization import tilted_down
 from dexsim.sensing.imu import measure_orientation
 from dexsim.sensing.taxels import TaxelArray, TaxelMemory
+
+
+@pytree_dataclass
+class SensorInput:
+    """What the sensors see at one instant, before latency, noise and counts."""
+
+    joint_position: jax.Array  # [J] rad
+    joint_torque: jax.Array  # [J] 1, torque over its limit
+    taxel_force: jax.Array  # [F, N] N
+    object_position: jax.Array  # [3] m
+    object_quat: jax.Array  # [4]
 
 
 class SensorSuite:
@@ -40,6 +52,7 @@ class SensorSuite:
         key: jax.Array,
         episode: Episode,
         now: SensorInput,
+        before: SensorInput,
         goal: tuple[jax.Array, jax.Array],
         last_action: jax.Array,
         last: State | None = None,
@@ -49,7 +62,7 @@ class SensorSuite:
         Args:
           key: of the noise.
           episode: the hand, the IMU and the taxels.
-          now: what the sensors see.
+          now, before: what the sensors see, and saw a tick ago.
           goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
           last_action: [J], the action that led here, as observations show it.
           last: the state one tick ago; None at the start of an episode.
@@ -58,7 +71,6 @@ class SensorSuite:
           The readings, and what the taxels remember.
         """
         sensing, hand = self.config.sensing, episode.hand
-        before = now if last is None else last.sensor_input
         age = hand.sensing_latency
         late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, now, before)
         keys = jax.random.split(key, 5)

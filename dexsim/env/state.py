@@ -34,17 +34,6 @@ class Episode:
 
 
 @pytree_dataclass
-class SensorInput:
-    """What the sensors see at one instant, before latency, noise and counts."""
-
-    joint_position: jax.Array  # [J] rad
-    joint_torque: jax.Array  # [J] 1, torque over its limit
-    taxel_force: jax.Array  # [F, N] N
-    object_position: jax.Array  # [3] m
-    object_quat: jax.Array  # [4]
-
-
-@pytree_dataclass
 class State:
     """One environment after a tick. J joints, F fingers, N taxels a finger."""
 
@@ -55,7 +44,8 @@ class State:
     previous_target: jax.Array  # [J] rad, the one before
     action: jax.Array  # [J], the last one applied
     goal: Any  # the task's own pytree
-    sensor_input: SensorInput  # the truth that the readings are made of
+    joint_torque: jax.Array  # [J] 1, true torque over its limit
+    taxel_force: jax.Array  # [F, N] N, true forces on the taxels
     readings: Readings
     tip_stiffness: jax.Array  # [F] of the fingertips' springs over nominal, for the next tick
     finger_force: jax.Array  # [F] N, true resultant forces of the object on the finger tips

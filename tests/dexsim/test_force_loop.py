@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.force_loop import ForceLoop, commanded_force, correct_command
-from dexsim.touch.estimate import ForceEstimate, estimate_force
+from dexsim.control import ForceLoop, commanded_force, correct_command
+from dexsim.touch.reduce import ForceEstimate, estimate_force
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
 LOOP = ForceLoop(gain=0.5, limit=0.6)

@@ -165,7 +165,7 @@ class TestTick:
         drive = c_scene.row(after.episode.hand.actuator, slice(None))
         position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
         torque = plain_drive(drive, np.asarray(after.joint_target), position, velocity)
-        np.testing.assert_allclose(after.sensor_input.joint_torque * hand.torque_limit, torque, atol=2e-5)
+        np.testing.assert_allclose(after.joint_torque * hand.torque_limit, torque, atol=2e-5)
 
     def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
@@ -346,9 +346,8 @@ class TestReadings:
         np.testing.assert_allclose(fields["joint_position"], after.physics.qpos[:, :12], atol=1e-6)
         np.testing.assert_allclose(fields["object_position"], after.physics.qpos[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)
-        np.testing.assert_allclose(fields["joint_torque"], after.sensor_input.joint_torque, atol=1e-6)
-        force = after.sensor_input.taxel_force.sum(-1)
-        np.testing.assert_allclose(fields["contact_force"], force, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(fields["joint_torque"], after.joint_torque, atol=1e-6)
+        np.testing.assert_allclose(fields["contact_force"], after.taxel_force.sum(-1), rtol=1e-5, atol=1e-5)
         tips = jax.jit(jax.vmap(lambda q: forward_kinematics(hand, q).tip_position))(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
@@ -395,6 +394,6 @@ class TestTouch:
 
         weight = mass * 9.81
         np.testing.assert_allclose(np.sum(state.finger_force, -1), weight, rtol=0.05)
-        np.testing.assert_allclose(np.sum(state.sensor_input.taxel_force, (-1, -2)), weight, rtol=0.05)
+        np.testing.assert_allclose(np.sum(state.taxel_force, (-1, -2)), weight, rtol=0.05)
         assert np.all(np.asarray(state.finger_force)[:, 0] == 0)
         assert np.all(np.asarray(state.finger_force)[:, 1:] > 0.05 * weight[:, None])

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dexsim.env.sensors import SensorSuite
-from dexsim.env.state import SensorInput
-from dexsim.sensing.config import Sensing
+from dexsim.env.config import Sensing
+from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.sensing.imu import ImuConfig, ImuParams
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
@@ -56,9 +55,8 @@ def read(hand):
         imu = dataclasses.replace(imu, bias=bias)
         episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.taxels.sample(jax.random.key(0), 0.0))
         readings, then = last or (None, now)
-        memory = suite.taxels.init()
-        before = SimpleNamespace(readings=readings, sensor_input=then, length=jnp.int32(3), taxel_memory=memory)
-        return suite.read(jax.random.key(key), episode, now, GOAL, jnp.full(12, 0.5), last and before)[0]
+        before = SimpleNamespace(readings=readings, length=jnp.int32(3), taxel_memory=suite.taxels.init())
+        return suite.read(jax.random.key(key), episode, now, then, GOAL, jnp.full(12, 0.5), last and before)[0]
 
     def plain(sensing, now, last=None, key=0, age=AGE, bias=(0.0, 0.0, 0.0)):
         return run(suite_of(sensing), now, last, key, jnp.float32(age), jnp.asarray(bias))

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dexsim.env.config import Sensing
 from dexsim.env.env import sample_episode
 from dexsim.env.sensors import SensorSuite
 from dexsim.randomization import Randomization
-from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams, measure_orientation
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.task import Rotate

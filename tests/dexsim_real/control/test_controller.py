@@ -10,6 +10,7 @@ from remembering import remembering
 
 pytest.importorskip("serial")
 from dexsim.control import Control
+from dexsim.env.config import Sensing
 from dexsim.env.env import Env
 from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Start
@@ -18,7 +19,6 @@ from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.randomization import Randomization
-from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.task_spec import TaskSpec
