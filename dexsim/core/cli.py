@@ -21,6 +21,7 @@ from dexsim.core.lazy_loading import restore_interrupt
 
 T = TypeVar("T")
 
+
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
     warnings.showwarning = _show_warning

@@ -29,8 +29,7 @@ from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
-from dexsim.tasks.placement import clearance, close_fingers, palm_height
-from dexsim.tasks.terms import action_rate, joint_speed, random_push
+from dexsim.tasks.shared import action_rate, clearance, close_fingers, joint_speed, palm_height, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""

@@ -31,7 +31,7 @@ from dexsim.objects.config import INACTIVE_SIZE, SHAPES, load_mesh_object
 from dexsim.objects.params import ObjectParams, extent, sample_object, unit_inertia
 from dexsim.physics import contact
 from dexsim.physics.model import build_scene, tip_bodies
-from dexsim.tasks.placement import clearance, close_fingers, palm_height
+from dexsim.tasks.shared import clearance, close_fingers, palm_height
 
 CLEARANCE = 0.001  # m, smallest gap between palm and object with support "fingers"
 _Z_TO_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)

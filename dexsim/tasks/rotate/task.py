@@ -25,7 +25,6 @@ from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
 from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
-from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import (
@@ -36,7 +35,7 @@ from dexsim.tasks.rotate.start import (
     sample_turned_object,
     solid_inertia,
 )
-from dexsim.tasks.terms import action_rate, joint_speed, random_push
+from dexsim.tasks.shared import action_rate, joint_speed, palm_height, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
 _EPSILON, _STEEPNESS = 0.1, 400.0  # rad and 1/m, of the paper's reward

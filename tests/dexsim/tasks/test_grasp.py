@@ -18,7 +18,7 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import COMMANDS, Grasp, GraspGoal, command_reward
-from dexsim.tasks.placement import clearance
+from dexsim.tasks.shared import clearance
 from dexsim.touch.taxel_force import Touch
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
