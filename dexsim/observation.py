@@ -112,7 +112,7 @@ def _orientation(hand: Hand, encoding: str) -> int:
     return 4 if encoding == "quaternion" else 6
 
 
-_FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], jax.Array], float | None], ...] = (
+_FIELDS = (
     ("joint_position", _joints, "hand", lambda f: f.readings.joint_position, None),
     ("joint_torque", _joints, "hand", lambda f: f.readings.joint_torque, 0.3),
     ("object_position", _fixed(3), "camera", lambda f: f.readings.object_position, None),
@@ -132,7 +132,7 @@ _FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], 
     ("joint_velocity", _joints, "simulator", lambda f: f.motion.joint_velocity, None),
     ("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin, None),
 )
-FIELDS: dict[str, ObservationField] = {row[0]: ObservationField(*row) for row in _FIELDS}
+FIELDS = {row[0]: ObservationField(*row) for row in _FIELDS}
 """Every field by name; a row of `_FIELDS` each."""
 
 

@@ -11,6 +11,7 @@ in `dexsim.env.evaluation`.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,12 +26,11 @@ from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
-from dexsim.env.touch import TouchModel
-from dexsim.geometry import rotations
+from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics
-from dexsim.objects.config import PROPERTY_RANGES
+from dexsim.hand.kinematics import HandPose, forward_kinematics
+from dexsim.objects.config import PROPERTY_RANGES, ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
@@ -38,6 +38,7 @@ from dexsim.randomization import sample_hand, tilted_down
 from dexsim.sensing.imu import sample_imu
 from dexsim.sensing.taxels import TaxelArray
 from dexsim.task_spec import TaskSpec, correct_readings
+from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals
 
 
 class Env:
@@ -63,7 +64,7 @@ class Env:
         self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
-        self.touch = TouchModel(config, hand)
+        self.touch_geometry = touch_geometry(config.objects, config.touch_method)
         self.sensors = SensorSuite(config, hand, task)
         self.observation_layout = self.sensors.layout
         self.control_period = config.physics.control_period
@@ -192,7 +193,7 @@ class Env:
         pose = forward_kinematics(self.hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        touch, normal_force, skin_force = self.touch.compute(pose, object, position, rotation, force, delta)
+        touch, normal_force, skin_force = self._feel(pose, object, (position, rotation), force, delta)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -211,6 +212,31 @@ class Env:
             action=action,
             last_action=last_action,
         )
+
+    def _feel(
+        self,
+        pose: HandPose,
+        object: ObjectParams,
+        place: tuple[jax.Array, jax.Array],
+        force: jax.Array,
+        pad_thickness_delta: jax.Array,
+    ) -> tuple[Touch, jax.Array, jax.Array]:
+        """What presses on the fingertips of an object at `place` (position, rotation): depths and forces of the taxels;
+        the part [F] N of `force` [F, 3] N that presses into the skin; the force [F] N, by the skin's law, for the
+        contact's springs."""
+        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
+        geometry = self.touch_geometry(object)
+        touch = compute_touch(hand, pose, geometry, *place, length(force), skin, pad_thickness_delta)
+        # In the links' frames, where the normals are constants.
+        local = rotations.rotate_inverse(pose.tip_rotation, force)
+        pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
+        normal = jnp.sum(pressed.force, -1)
+        touch = pressed if skin.total == "pressing" else touch
+        if self.config.touch_method == "closed_form" and skin.margin == thickness:
+            return touch, normal, jnp.sum(touch.skin_force, -1)  # the springs' geometry and rubber
+        delta = jnp.maximum(pad_thickness_delta, -thickness)  # the solver's
+        bearing = compute_touch(hand, pose, object.shape(), *place, jnp.ones(hand.num_fingers), skin, delta)
+        return touch, normal, jnp.sum(bearing.skin_force, -1)
 
     def _observe(
         self,
@@ -288,6 +314,29 @@ def sample_episode(
         imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
         taxels=taxels.sample(jax.random.fold_in(sensor_key, 1), width),
     )
+
+
+def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:
+    """A pure function from one episode's object to its geometry, as `dexsim.geometry.distance` takes it.
+
+    The method is closed_form (the solver's primitives), grid (the mesh, baked) or surface_points (points on the mesh,
+    or on the primitives at their drawn sizes).
+
+    Raises:
+      AssetError: the mesh cannot be baked.
+      ConfigError: a grid of primitives, whose sizes are drawn anew in every episode.
+    """
+    if method == "closed_form":
+        return ObjectParams.shape
+    if not config.mesh:
+        if method == "grid":
+            raise ConfigError("touch_method = 'grid': needs ObjectConfig.mesh; or choose closed_form or surface_points")
+        return lambda object: surface_points.from_shape(object.shape())
+    mesh_object = load_mesh_object(config)
+    module: Any = grid if method == "grid" else surface_points
+    with jax.ensure_compile_time_eval():
+        geometry = grid.bake(mesh_object.mesh) if method == "grid" else surface_points.from_mesh(mesh_object.mesh)
+    return lambda object: module.scaled(geometry, object.size[0, 0] / mesh_object.boxes.size[0, 0])
 
 
 def _common_metrics(
