@@ -7,7 +7,6 @@ configuration.
 
 import dataclasses
 import functools
-import hashlib
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -140,12 +139,10 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     settings = {name: value for name, value in to_dict(config).items() if name not in _UNUSED}
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
     turn = config.turn.axis, config.turn.distance
-    given = [settings, motors, turn, hand.digest, np.asarray(jax.random.key_data(key)).tolist()]
     boxes = load_mesh_object(config.objects).boxes if config.objects.mesh else None
-    files = hashlib.sha256(hand.model_path.read_bytes())
-    for part in (boxes.size, boxes.position, boxes.quat) if boxes else ():
-        files.update(part.tobytes())
-    return f"{json.dumps(given, sort_keys=True)} {files.hexdigest()} {_VERSION} {mujoco.__version__}"
+    mesh = [part.tolist() for part in (boxes.size, boxes.position, boxes.quat)] if boxes else None
+    given = settings, motors, turn, mesh, hand.digest, np.asarray(jax.random.key_data(key)).tolist()
+    return json.dumps([*given, _VERSION, mujoco.__version__], sort_keys=True)
 
 
 def _make(
