@@ -114,7 +114,6 @@ def correct_command(
     """The next correction [] of the command.
 
     Args:
-      loop: settings.
       span: N, a finger's target at the commands 0 and 1.
       period: s, control tick.
       command: [] in [0, 1].

@@ -183,7 +183,6 @@ def catalog() -> dict[str, list[str]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command `dexsim tasks`, which has no options. Returns its exit code."""
-    del argv
     for kind, names in catalog().items():
         print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
     return 0

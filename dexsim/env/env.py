@@ -45,13 +45,8 @@ class Env:
     """A task on a hand: `reset(key)`, `step(state, action)`, `restart(state, done)`."""
 
     def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", seed: int = 0):
-        """Compile the scene and fill the pool of start states.
-
-        Args:
-          task: the task with its configuration.
-          hand: the hand.
-          backend: "auto", "c", "cuda" or "mjx".
-          seed: of the pool. Evaluations have pools of their own.
+        """Compile the scene for `backend` ("auto", "c", "cuda" or "mjx") and fill the pool of start states by `seed`;
+        evaluations have pools of their own.
 
         Raises:
           AssetError, ConfigError: see `Physics`, `load_hand`, `check_timestep`.

@@ -57,18 +57,13 @@ class SensorSuite:
         last_action: jax.Array,
         last: State | None = None,
     ) -> tuple[Readings, TaxelMemory]:
-        """What the host gets to know.
+        """What the host gets to know, and what the taxels remember.
 
         Args:
-          key: of the noise.
-          episode: the hand, the IMU and the taxels.
           now, before: what the sensors see, and saw a tick ago.
           goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
           last_action: [J], the action that led here, as observations show it.
           last: the state one tick ago; None at the start of an episode.
-
-        Returns:
-          The readings, and what the taxels remember.
         """
         sensing, hand = self.config.sensing, episode.hand
         age = hand.sensing_latency

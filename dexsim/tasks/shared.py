@@ -1,5 +1,7 @@
 """What tasks share: where an object can be put, reward terms on the motion of the hand, pushes on the object."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,14 +68,12 @@ def joint_speed(velocity: jax.Array) -> jax.Array:
     return jnp.sum(velocity**2)
 
 
-def random_push(key: jax.Array, mass: jax.Array, *, probability: float, speed: float, period: float) -> jax.Array:
-    """Force [3] N that, with this probability, acts for a tick of `period` s.
-
-    It changes the velocity of `mass` kg by up to `speed` m/s in a random direction.
-    """
+def random_push(key: jax.Array, mass: jax.Array, config: Any) -> jax.Array:
+    """Force [3] N that acts for a tick, with `config.push_probability`: it changes the velocity of `mass` kg by up to
+    `config.push_speed` m/s in a random direction."""
     when, where, strength = jax.random.split(key, 3)
     direction = jax.random.normal(where, (3,))
     direction = direction / (jnp.linalg.norm(direction) + 1e-9)
-    change = speed * jax.random.uniform(strength)
-    hit = jax.random.bernoulli(when, probability)
-    return jnp.where(hit, mass * change / period, 0.0) * direction
+    change = config.push_speed * jax.random.uniform(strength)
+    hit = jax.random.bernoulli(when, config.push_probability)
+    return jnp.where(hit, mass * change / config.physics.control_period, 0.0) * direction

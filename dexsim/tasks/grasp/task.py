@@ -192,7 +192,6 @@ class Grasp(Task):
         return self.config.objects.kinds
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
-        del start
         goal = GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
         low, high = self.config.release_delay
         if high == 0:
@@ -200,7 +199,6 @@ class Grasp(Task):
         return dataclasses.replace(goal, delay=jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high))
 
     def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
-        del truth
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, _COMMAND_CHANGE) & ~goal.fixed
         return dataclasses.replace(
@@ -219,11 +217,9 @@ class Grasp(Task):
         return target_force(goal.command, self.finger_force)
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        chance, speed = self.config.push_probability, self.config.push_speed
-        return random_push(key, object.mass, probability=chance, speed=speed, period=self.config.physics.control_period)
+        return random_push(key, object.mass, self.config)
 
     def dropped(self, goal: GraspGoal, truth: GroundTruth) -> jax.Array:
-        del goal
         away = length(truth.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 

@@ -142,7 +142,6 @@ class Rotate(Task):
 
     def sample_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`; there is only one kind."""
-        del shape_index
         return sample_turned_object(key, config.placed_on(self.hand))
 
     def unit_inertia(self, object: ObjectParams) -> jax.Array:
@@ -152,9 +151,7 @@ class Rotate(Task):
         return solid_inertia(object)
 
     def begin(self, key: jax.Array | None, start: Start | None) -> RotateGoal:
-        del key, start
-        zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-        fingers = jnp.zeros(self.hand.num_fingers)
+        zero, none, fingers = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros(self.hand.num_fingers)
         return RotateGoal(
             turns=none,
             entered=jnp.zeros((), bool),
@@ -179,9 +176,7 @@ class Rotate(Task):
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
     def update(self, key: jax.Array | None, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
-        del key  # nothing here is random
-        now, period = self.progress(goal, truth), self._period
-        touching = self._touching(truth)
+        now, period, touching = self.progress(goal, truth), self._period, self._touching(truth)
         clock = goal.clock + period
         change = {
             "spin": now.spin,
@@ -210,8 +205,7 @@ class Rotate(Task):
         return goal.turns
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        chance, speed = self.config.push_probability, self.config.push_speed
-        return random_push(key, object.mass, probability=chance, speed=speed, period=self._period)
+        return random_push(key, object.mass, self.config)
 
     def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         away = length(truth.object_position - jnp.asarray(self.reference))
@@ -226,11 +220,9 @@ class Rotate(Task):
         self, goal: RotateGoal, truth: GroundTruth, dropped: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
-        weights, now = self.config.reward, self.progress(goal, truth)
+        weights, now, after = self.config.reward, self.progress(goal, truth), self.update(None, goal, truth)
         fallen = dropped.astype(jnp.float32)
-        held = 1.0 - fallen
-        after = self.update(None, goal, truth)
-        work = tips_at_work(after.duty)
+        held, work = 1.0 - fallen, tips_at_work(after.duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= _FROM_GOAL).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))
