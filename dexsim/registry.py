@@ -124,12 +124,7 @@ def task_option(name: str) -> str:
 
 
 def make(
-    task: str,
-    config: EnvConfig | None = None,
-    *,
-    backend: str = "auto",
-    hand: Hand | None = None,
-    seed: int = 0,
+    task: str, config: EnvConfig | None = None, *, backend: str = "auto", hand: Hand | None = None, seed: int = 0
 ) -> Env:
     """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is set.
 

@@ -234,13 +234,7 @@ class Env:
         return touch, normal, jnp.sum(bearing.skin_force, -1)
 
     def _observe(
-        self,
-        key: jax.Array,
-        episode: Episode,
-        command: JointCommand,
-        goal: Any,
-        truth: GroundTruth,
-        last: State | None,
+        self, key: jax.Array, episode: Episode, command: JointCommand, goal: Any, truth: GroundTruth, last: State | None
     ) -> dict[str, Any]:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
