@@ -30,7 +30,7 @@ from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics
-from dexsim.objects.config import PROPERTY_RANGES, ObjectConfig, load_mesh_object
+from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
@@ -290,7 +290,7 @@ def sample_episode(
     """
     hand_key, sensor_key, object_key = keys
     config, ranges, period = task.config, task.config.randomization, task.config.physics.control_period
-    if drawn := tuple(name for name in PROPERTY_RANGES if f"objects.{name}" in task.object_ranges):
+    if drawn := tuple(name.removeprefix("objects.") for name in task.object_ranges):
         object = resample_properties(object_key, object, config.objects, task.unit_inertia(object), drawn)
     if scale is not None:
         object = toward_nominal(object, config.objects, task.unit_inertia(object), scale)

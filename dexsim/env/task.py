@@ -18,6 +18,7 @@ from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.hand.kinematics import HandPose
 from dexsim.objects import params
+from dexsim.objects.config import KINDS, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import FIELDS
 from dexsim.task_spec import TurnSpec
@@ -88,11 +89,13 @@ class Task(abc.ABC):
     """Length of an evaluation episode, control ticks."""
     evaluation: str
     """What `summarize` is given: "series" or "totals"."""
-    object_ranges: tuple[str, ...]
-    """Paths in `config` of the ranges that `sample_object` draws from. Those of `PROPERTY_RANGES`, as "objects.mass",
-    are drawn anew at every episode start; the others stay as the pool has them."""
     config: EnvConfig
     """An `EnvConfig` or a subclass with settings of the task's own."""
+    object_ranges: tuple[str, ...] = tuple(f"objects.{name}" for name in PROPERTY_RANGES)
+    """Ranges of physical properties, as "objects.mass", that are drawn anew at every episode start; the others, and
+    sizes, stay as the pool has them."""
+    shape_names: tuple[str, ...] = KINDS
+    """What `ObjectParams.shape_index` counts."""
     posture: tuple[float, ...] = ()
     """rad, joint angles [J] that an episode on a hand starts from; empty: from wherever the hand is."""
     turn: TurnSpec | None = None

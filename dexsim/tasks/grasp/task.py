@@ -25,7 +25,6 @@ from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
-from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
@@ -91,8 +90,6 @@ class Grasp(Task):
     evaluation = "series"
     fields: dict[str, tuple[str, ...]] = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
-    shape_names = KINDS
-    """What `ObjectParams.shape_index` counts."""
 
     config: GraspConfig
     finger_force: tuple[float, float]
@@ -106,7 +103,6 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
-        self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots, self._closing = hand.root_joint, closing(hand)
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))

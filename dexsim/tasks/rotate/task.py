@@ -23,7 +23,6 @@ from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
-from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
 from dexsim.tasks.rotate.report import summarize
@@ -108,8 +107,6 @@ class Rotate(Task):
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
-    shape_names = KINDS
-    """What `ObjectParams.shape_index` counts."""
 
     config: RotateConfig
 
@@ -123,8 +120,6 @@ class Rotate(Task):
         self._placed = placed = config.placed_on(hand)
         self.turn = placed.turn
         self.slots, self.largest = config.objects.slots, largest_size(config)
-        drawn = ("edge", "proportions", *(f"objects.{name}" for name in PROPERTY_RANGES))
-        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
