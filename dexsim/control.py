@@ -6,7 +6,6 @@ sees the corrected command.
 """
 
 import dataclasses
-import functools
 from typing import TypeVar
 
 import jax
@@ -15,7 +14,6 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics, taxel_normals
 
 Array = TypeVar("Array", jax.Array, np.ndarray)
 
@@ -61,22 +59,6 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
     target = target + control.step * action
     target = jnp.clip(target, measured - control.reach, measured + control.reach)
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
-
-
-@functools.cache
-def closing(hand: Hand) -> np.ndarray:
-    """Signs [F] of the root joints' rotation that closes the fingers: it moves a fingertip where its skin faces."""
-    rest = np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper)
-
-    @jax.jit
-    def directions(posture: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moves = jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position)(posture)
-        return moves, taxel_normals(hand, forward_kinematics(hand, posture))
-
-    with jax.ensure_compile_time_eval():
-        moves, normals = map(np.asarray, directions(jnp.asarray(hand.grasp_posture or rest, jnp.float32)))
-    moves, faces = moves[np.arange(hand.num_fingers), :, hand.root_joint], normals.mean(1)
-    return np.where(np.sum(moves * faces, -1) < 0, -1.0, 1.0).astype(np.float32)
 
 
 def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:

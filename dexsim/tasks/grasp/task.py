@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim import observation
-from dexsim.control import closing, commanded_force, target_force
+from dexsim.control import commanded_force, target_force
 from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
@@ -49,7 +49,7 @@ class GraspGoal:
 
     command: jax.Array  # [] in [0, 1]
     fixed: jax.Array  # [] bool, the command never changes (evaluation)
-    delay: jax.Array | None = None  # [] s until the object is let go
+    delay: jax.Array  # [] s until the object is let go
 
 
 def tailed_gaussian(error: jax.Array, sigma: float, tail: float) -> jax.Array:
@@ -103,7 +103,7 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
-        self._roots, self._closing = hand.root_joint, closing(hand)
+        self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
@@ -188,11 +188,9 @@ class Grasp(Task):
         return self.config.objects.kinds
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
-        goal = GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
         low, high = self.config.release_delay
-        if high == 0:
-            return goal
-        return dataclasses.replace(goal, delay=jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high))
+        delay = jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high)
+        return GraspGoal(jax.random.uniform(key), jnp.zeros((), bool), delay)
 
     def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
         when, what = jax.random.split(key)
@@ -200,11 +198,11 @@ class Grasp(Task):
         return dataclasses.replace(
             goal,
             command=jnp.where(change, jax.random.uniform(what), goal.command),
-            delay=None if goal.delay is None else goal.delay - self.config.physics.control_period,
+            delay=goal.delay - self.config.physics.control_period,
         )
 
-    def held(self, goal: GraspGoal) -> jax.Array | None:
-        return None if goal.delay is None else goal.delay > 0
+    def held(self, goal: GraspGoal) -> jax.Array:
+        return goal.delay > 0
 
     def goal_readings(self, goal: GraspGoal) -> tuple[jax.Array, jax.Array]:
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -225,7 +223,7 @@ class Grasp(Task):
         force = length(truth.finger_force)
         contact = force > _CONTACT
         target = self.target_force(goal)
-        torque = truth.joint_torque[self._roots] * self._closing
+        torque = truth.joint_torque[self._roots]  # positive closes the finger; `dexsim check-hand` checks it
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers, too_much = self._finger_joints, jnp.maximum(force[1:] - (target + _MARGIN), 0.0)
@@ -280,11 +278,9 @@ class Grasp(Task):
             of_shape = np.flatnonzero(shape_index == shape)
             mine = target == shape
             index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
-        goal = GraspGoal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
-        if self.config.release_delay[1] > 0:
-            delay = np.random.default_rng(0).uniform(*self.config.release_delay, count)
-            goal = dataclasses.replace(goal, delay=jnp.asarray(delay, jnp.float32))
-        return index, goal
+        commands = jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32)
+        delay = np.random.default_rng(0).uniform(*self.config.release_delay, count)
+        return index, GraspGoal(commands, jnp.ones(count, bool), jnp.asarray(delay, jnp.float32))
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""

@@ -61,7 +61,7 @@ def make_moment(hand, **changes):
 
 
 def goal_of(command):
-    return GraspGoal(jnp.float32(command), jnp.zeros((), bool))
+    return GraspGoal(jnp.float32(command), jnp.zeros((), bool), jnp.zeros(()))
 
 
 class TestTerms:
