@@ -34,7 +34,7 @@ from dexsim.tasks.rotate.task import Rotate
 class TaskEntry:
     """How a task is made."""
 
-    task: Callable[[Any, Hand], Task]  # `task(config, hand)`: the rules
+    task: Callable[[Any, Hand], Task]  # `task(config, hand)`: the rules; None with `environment`
     config: Callable[[], EnvConfig]  # makes the configuration that the name stands for
     environment: Callable[[], Any] | None = None  # makes one that is no task on a hand: no rules, no settings
 
@@ -105,7 +105,7 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
         # Many modules may have a `make_env`: the one that is named makes it.
         if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
-            TASKS[word] = TaskEntry(_no_task, cast(Any, NoSettings), makes)
+            TASKS[word] = TaskEntry(cast(Any, None), cast(Any, NoSettings), makes)
         if word in TASKS:
             _MODULES[word] = module
     if word not in TASKS:
@@ -158,15 +158,8 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     task = check_task(entry.task(config, hand))
     home = TASKS.get(task.name)
     if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
-        raise ConfigError(
-            f"task {name!r}: its class {type(task).__name__} has the name {task.name!r}, by which "
-            f"{'another task' if home else 'no task'} is registered; give the class name = {name!r}"
-        )
+        raise ConfigError(f"task {name!r}: its class {type(task).__name__} has name = {task.name!r}; give it {name!r}")
     return task
-
-
-def _no_task(config: Any, hand: Hand) -> Task:
-    raise ConfigError("not supported without a hand: such an environment can only be trained and evaluated")
 
 
 def catalog() -> dict[str, list[str]]:
