@@ -216,9 +216,9 @@ class Env:
         force: jax.Array,
         pad_thickness_delta: jax.Array,
     ) -> tuple[Touch, jax.Array, jax.Array]:
-        """What presses on the fingertips of an object at `place` (position, rotation): depths and forces of the taxels;
-        the part [F] N of `force` [F, 3] N that presses into the skin; the force [F] N, by the skin's law, for the
-        contact's springs."""
+        """What the fingertips feel of an object at `place` (position [3] m, rotation [3, 3]) that presses with `force`
+        [F, 3] N, palm frame: depths and forces of the taxels; the part [F] N of `force` that presses into the skin; the
+        force [F] N, by the skin's law, for the contact's springs."""
         hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
         geometry = self.touch_geometry(object)
         touch = compute_touch(hand, pose, geometry, *place, length(force), skin, pad_thickness_delta)
