@@ -242,23 +242,17 @@ class Grasp(Task):
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "drop": weights.drop * fallen,
         }
-        metrics = {f"reward/{name}": value for name, value in terms.items()}
-        return jnp.asarray(sum(terms.values())), metrics | self._metrics(goal, truth, held)
-
-    def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
-        force = length(truth.finger_force)
-        contact = force > _CONTACT
         parts = {"force": force, "normal": truth.normal_force, "taxels": jnp.sum(truth.touch.force, -1)}
         commanded = {f"finger_{name}": commanded_force(part, contact) for name, part in parts.items()}
-        return {
+        pull = jnp.where(contact, jnp.abs(torque), 0.0)
+        return jnp.asarray(sum(terms.values())), {
+            **{f"reward/{name}": value for name, value in terms.items()},
             "success": held,
             "command": goal.command,
-            "force_error": jnp.abs(commanded["finger_force"] - self.target_force(goal)),
+            "force_error": jnp.abs(commanded["finger_force"] - target),
             **commanded,
             "total_force": jnp.sum(force),
-            "total_torque": jnp.sum(
-                jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
-            ),
+            "total_torque": jnp.sum(pull / self._max_torque),
             "touching": jnp.sum(contact).astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
