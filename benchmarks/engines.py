@@ -45,7 +45,7 @@ from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.model import build_scene
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
 from dexsim.registry import TASKS
-from dexsim.tasks.placement import palm_height
+from dexsim.tasks.shared import palm_height
 from dexsim_ppo import evaluate_policy, load_policy
 
 MOTIONS = ("grip", "slide", "roll", "drop")

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.control import target_force
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import DexsimError
 from dexsim.core.statistics import mean, proportion, ratio
-from dexsim.force_loop import target_force
 from dexsim.hand.description import Hand
 from dexsim.render.snapshot import Snapshot
 from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope

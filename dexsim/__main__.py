@@ -14,7 +14,7 @@ from dexsim.core.install import require
 from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
 
 COMMANDS = {
-    "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
+    "tasks": ("dexsim.registry", "list tasks, hands and shipped policies"),
     "train": ("dexsim_ppo.train", "train a task"),
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
     "demo": ("dexsim.view.__main__", "show a trained hand in the browser, without JAX too"),
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in WITHOUT_JAX:
         require("jax", "train", f"dexsim {name}")
     if name == "train":
-        cli.announce(cli.LOADING)
+        cli.announce_loading()
     exit_on_interrupt()
     module = importlib.import_module(COMMANDS[name][0])
     restore_interrupt()

@@ -28,7 +28,7 @@ from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinema
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import hand_poses
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.placement import clearance, palm_height
+from dexsim.tasks.shared import clearance, palm_height
 
 _POSES, _ENVS = 20, 16
 _NEAR, _ALIGNED = 1e-5, 1e-4  # m and rad, of link poses in float32

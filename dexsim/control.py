@@ -1,16 +1,35 @@
-"""From an action to joint targets: the same code in simulation and on the hand."""
+"""From an action to joint targets, and the force loop around a policy that takes a force command: what the fingers
+lack is added to the command. The same code in simulation and on the hand.
+
+The loop integrates the difference between the commanded force and the estimated one (`commanded_force`). The policy
+sees the corrected command.
+"""
 
 import dataclasses
-import functools
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.config import Config, setting
-from dexsim.force_loop import ForceLoop
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics, taxel_normals
+
+Array = TypeVar("Array", jax.Array, np.ndarray)
+
+# Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
+_LOW, _HIGH = 0.0, 1.5
+_SLEW = 1.0  # 1/s, largest rate of the correction
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ForceLoop(Config):
+    """Settings of the loop."""
+
+    gain: float = setting(0.0, unit="1/s", low=0.0, high=20.0)
+    """Rate at which the command is corrected, per error; 0 turns the loop off."""
+    limit: float = setting(0.6, unit="1", low=0.0, high=2.0)
+    """Largest correction of the command."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,25 +61,53 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
 
 
-@functools.cache
-def closing(hand: Hand) -> np.ndarray:
-    """Signs [F] of the root joints' rotation that closes the fingers: it moves a fingertip where its skin faces."""
-    rest = np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper)
-
-    @jax.jit
-    def directions(posture: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moves = jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position)(posture)
-        return moves, taxel_normals(hand, forward_kinematics(hand, posture))
-
-    with jax.ensure_compile_time_eval():
-        moves, normals = map(np.asarray, directions(jnp.asarray(hand.grasp_posture or rest, jnp.float32)))
-    moves, faces = moves[np.arange(hand.num_fingers), :, hand.root_joint], normals.mean(1)
-    return np.where(np.sum(moves * faces, -1) < 0, -1.0, 1.0).astype(np.float32)
-
-
 def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:
     """The last action [J] in [-1, 1] as an observation shows it; `target` [J] rad is its outcome."""
     if control.last_action_encoding == "action":
         return action
     middle = (hand.joint_upper + hand.joint_lower) / 2
     return (target - middle) / ((hand.joint_upper - hand.joint_lower) / 2)
+
+
+def target_force(command: Array, span: tuple[float, float]) -> Array:
+    """Force [...] N that each touching finger but the thumb should press with, `span` at the commands 0 and 1."""
+    return span[0] + command * (span[1] - span[0])
+
+
+def commanded_force(force: jax.Array, touching: jax.Array) -> jax.Array:
+    """The force [] N that a command speaks of: the mean over the touching fingers, 0 where none touches.
+
+    Args:
+      force: [F] N. The first finger, the thumb, balances the others and does not count.
+      touching: [F] bool.
+    """
+    total = jnp.sum(jnp.where(touching, force, 0.0)[1:])
+    return total / jnp.maximum(jnp.sum(touching[1:].astype(jnp.float32)), 1.0)
+
+
+def correct_command(
+    loop: ForceLoop,
+    span: tuple[float, float],
+    period: float,
+    command: jax.Array,
+    correction: jax.Array,
+    force: jax.Array,
+) -> jax.Array:
+    """The next correction [] of the command.
+
+    Args:
+      span: N, a finger's target at the commands 0 and 1.
+      period: s, control tick.
+      command: [] in [0, 1].
+      correction: [] so far; it stays while fewer than two fingers beside the first touch.
+      force: [F] N estimated, zero where nothing touches.
+    """
+    if span[0] == span[1]:  # No command speaks of another force.
+        return correction
+    touching = force > 0
+    measured = commanded_force(force, touching)
+    error = command - (measured - span[0]) / (span[1] - span[0])
+    change = jnp.clip(loop.gain * error, -_SLEW, _SLEW) * period
+    moved = jnp.where(jnp.sum(touching[1:]) >= 2, correction + change, correction)
+    # No windup: the sum stays in what a policy is shown.
+    return jnp.clip(moved, jnp.maximum(-loop.limit, _LOW - command), jnp.minimum(loop.limit, _HIGH - command))

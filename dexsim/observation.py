@@ -20,8 +20,7 @@ from dexsim.geometry.mirror import AXIAL, POLAR, QUAT
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
 from dexsim.hand.mirror import mirror_hand
-from dexsim.touch.estimate import ForceEstimate, estimate_force
-from dexsim.touch.reduce import reduce_touch_links
+from dexsim.touch.reduce import ForceEstimate, estimate_force, reduce_touch_links
 
 
 @pytree_dataclass
@@ -55,17 +54,15 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Features:
-    """What the fields are made of, computed once from the readings."""
+    """What the fields are made of."""
 
     hand: Hand
     readings: Readings
-    encoding: str  # of orientations, see `ObservationConfig.orientation`
+    config: "ObservationConfig"
+    motion: Any  # `Motion`; None for an actor, whose fields do not ask for it
+    pose: HandPose
     contact_force: jax.Array  # [F] N
     contact_centre: jax.Array  # [F, 3] m
-    finger_force: Callable[[], jax.Array]  # [F] N, estimated from taxels and torque
-    pose: HandPose
-    motion: Any  # `Motion`; None for an actor, whose fields do not ask for it
-    twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,16 +82,21 @@ class ObservationField:
     statistics of a signal that is mostly zero explode at the first contact."""
 
 
-def _encode(quat: jax.Array, encoding: str) -> jax.Array:
-    if encoding == "quaternion":
-        return quat
-    return rotations.matrix_to_6d(rotations.quat_to_matrix(quat))
+def _encode(f: Features, quat: jax.Array) -> jax.Array:
+    return quat if f.config.orientation == "quaternion" else rotations.matrix_to_6d(rotations.quat_to_matrix(quat))
 
 
 def _relative_orientation(f: Features) -> jax.Array:
     """Rotation that takes the object to its goal, in the palm frame."""
-    relative = rotations.quat_multiply(f.readings.goal_quat, rotations.quat_conjugate(f.readings.object_quat))
-    return _encode(relative, f.encoding)
+    return _encode(f, rotations.quat_multiply(f.readings.goal_quat, rotations.quat_conjugate(f.readings.object_quat)))
+
+
+def _finger_force(f: Features) -> jax.Array:
+    return estimate_force(f.config.force, f.hand, f.readings.taxel_force, f.readings.joint_torque)
+
+
+def _fingertip_velocity(f: Features) -> jax.Array:
+    return tip_twist(f.hand, f.readings.joint_position, f.motion.joint_velocity).ravel()
 
 
 def _joints(hand: Hand, encoding: str) -> int:
@@ -113,14 +115,14 @@ def _orientation(hand: Hand, encoding: str) -> int:
     return 4 if encoding == "quaternion" else 6
 
 
-_FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], jax.Array], float | None], ...] = (
+_FIELDS = (
     ("joint_position", _joints, "hand", lambda f: f.readings.joint_position, None),
     ("joint_torque", _joints, "hand", lambda f: f.readings.joint_torque, 0.3),
     ("object_position", _fixed(3), "camera", lambda f: f.readings.object_position, None),
     ("object_velocity", _fixed(3), "camera", lambda f: f.readings.object_velocity, None),
     ("contact_force", _per_finger(1), "hand", lambda f: f.contact_force, 5.0),
     ("contact_centre", _per_finger(3), "hand", lambda f: f.contact_centre.ravel(), 0.1),
-    ("finger_force", _per_finger(1), "hand", lambda f: f.finger_force(), 5.0),
+    ("finger_force", _per_finger(1), "hand", _finger_force, 5.0),
     ("fingertip_position", _per_finger(3), "hand", lambda f: f.pose.tip_position.ravel(), None),
     ("fingertip_rotation", _per_finger(6), "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(), None),
     ("command", _fixed(1), "user", lambda f: f.readings.command[None], 0.5),
@@ -128,12 +130,12 @@ _FIELDS: tuple[tuple[str, Callable[[Hand, str], int], str, Callable[[Features], 
     ("past_actions", lambda hand, _: 2 * hand.num_joints, "policy", lambda f: f.readings.past_actions.ravel(), 1.0),
     ("palm_gravity", _fixed(3), "imu", lambda f: f.readings.palm_gravity, 1.0),
     ("relative_orientation", _orientation, "imu", _relative_orientation, None),
-    ("object_orientation", _orientation, "imu", lambda f: _encode(f.readings.object_quat, f.encoding), None),
-    ("fingertip_velocity", _per_finger(6), "simulator", lambda f: f.twist().ravel(), None),
+    ("object_orientation", _orientation, "imu", lambda f: _encode(f, f.readings.object_quat), None),
+    ("fingertip_velocity", _per_finger(6), "simulator", _fingertip_velocity, None),
     ("joint_velocity", _joints, "simulator", lambda f: f.motion.joint_velocity, None),
     ("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin, None),
 )
-FIELDS: dict[str, ObservationField] = {row[0]: ObservationField(*row) for row in _FIELDS}
+FIELDS = {row[0]: ObservationField(*row) for row in _FIELDS}
 """Every field by name; a row of `_FIELDS` each."""
 
 
@@ -247,17 +249,7 @@ def observe(
         return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion and mirror_motion(motion))
     if pose is None:
         pose = forward_kinematics(hand, readings.joint_position)
-    force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
-    features = Features(
-        hand=hand,
-        readings=readings,
-        encoding=config.orientation,
-        contact_force=force,
-        contact_centre=centre,
-        finger_force=lambda: estimate_force(config.force, hand, readings.taxel_force, readings.joint_torque),
-        pose=pose,
-        motion=motion,
-        twist=lambda: tip_twist(hand, readings.joint_position, features.motion.joint_velocity),
-    )
+    contact = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
+    features = Features(hand, readings, config, motion, pose, *contact)
     parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
     return jnp.concatenate(parts).astype(jnp.float32)

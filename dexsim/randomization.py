@@ -134,9 +134,6 @@ def sample_hand(
     """Draw one episode's hand.
 
     Args:
-      key: of this episode.
-      config: the ranges.
-      hand: numbers of joints and fingers, torque and speed limits.
       timestep, control_period: s, of a physics sub-step and a control tick.
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """

@@ -1,4 +1,4 @@
-"""Tasks by name: those of the library, those that installed packages bring, and the user's own.
+"""Tasks by name: those of the library, those that installed packages bring, and the user's own; `dexsim tasks`.
 
 dexsim.register("poke", Poke)        # Poke(config: PokeConfig, hand: Hand)
 env = dexsim.make("poke")
@@ -10,19 +10,20 @@ import importlib.metadata
 import inspect
 import os
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import jax
 
-from dexsim.core.cli import enable_caches
+from dexsim.core import cli
+from dexsim.core.assets import asset_path
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
 from dexsim.env.task import Task, check_task
 from dexsim.hand.description import Hand
-from dexsim.hand.load import load_hand
+from dexsim.hand.load import DEFAULT, load_hand
 from dexsim.tasks.grasp import config as grasp
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate import config as rotate
@@ -33,12 +34,9 @@ from dexsim.tasks.rotate.task import Rotate
 class TaskEntry:
     """How a task is made."""
 
-    task: Callable[[Any, Hand], Task]
-    """`task(config, hand)`: the rules; see `dexsim.env.task.Task`."""
-    config: Callable[[], EnvConfig]
-    """Makes the configuration that the name stands for."""
-    environment: Callable[[], Any] | None = None
-    """Makes an environment that is no task on a hand; the entry then has no rules and no settings."""
+    task: Callable[[Any, Hand], Task]  # `task(config, hand)`: the rules; None with `environment`
+    config: Callable[[], EnvConfig]  # makes the configuration that the name stands for
+    environment: Callable[[], Any] | None = None  # makes one that is no task on a hand: no rules, no settings
 
     @property
     def config_class(self) -> type[EnvConfig]:
@@ -81,11 +79,9 @@ def register(
         raise ConfigError(f"{where}: the name must be a word, such as 'poke'")
     if config is None:
         hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
-        config = hints.get(next(iter(inspect.signature(factory).parameters)))
-        if not (inspect.isclass(config) and issubclass(config, EnvConfig)):
-            raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig, or give config=")
+        config = hints.get(next(iter(inspect.signature(factory).parameters)), type(None))
     if not isinstance(config(), EnvConfig):
-        raise ConfigError(f"{where}: the configuration is a {type(config()).__name__}, not an EnvConfig")
+        raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig, or give config=")
     taken = TASKS.get(name)
     if taken is not None and getattr(taken.task, "__qualname__", None) != getattr(factory, "__qualname__", ""):
         raise ConfigError(f"{where}: there is a task of that name already")
@@ -109,7 +105,7 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
         # Many modules may have a `make_env`: the one that is named makes it.
         if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
-            TASKS[word] = TaskEntry(_no_task, cast(Any, NoSettings), makes)
+            TASKS[word] = TaskEntry(cast(Any, None), cast(Any, NoSettings), makes)
         if word in TASKS:
             _MODULES[word] = module
     if word not in TASKS:
@@ -128,12 +124,7 @@ def task_option(name: str) -> str:
 
 
 def make(
-    task: str,
-    config: EnvConfig | None = None,
-    *,
-    backend: str = "auto",
-    hand: Hand | None = None,
-    seed: int = 0,
+    task: str, config: EnvConfig | None = None, *, backend: str = "auto", hand: Hand | None = None, seed: int = 0
 ) -> Env:
     """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is set.
 
@@ -149,7 +140,7 @@ def make(
     """
     cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
-        enable_caches()
+        cli.enable_caches()
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
             raise ConfigError(f"task {task!r} takes no config: it is not a task on a hand")
@@ -167,12 +158,23 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     task = check_task(entry.task(config, hand))
     home = TASKS.get(task.name)
     if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
-        raise ConfigError(
-            f"task {name!r}: its class {type(task).__name__} has the name {task.name!r}, by which "
-            f"{'another task' if home else 'no task'} is registered; give the class name = {name!r}"
-        )
+        raise ConfigError(f"task {name!r}: its class {type(task).__name__} has name = {task.name!r}; give it {name!r}")
     return task
 
 
-def _no_task(config: Any, hand: Hand) -> Task:
-    raise ConfigError("not supported without a hand: such an environment can only be trained and evaluated")
+def catalog() -> dict[str, list[str]]:
+    """Names of tasks, hands and shipped policies."""
+    hands = [path.stem for path in asset_path("hand").rglob("*.toml")]
+    policies = [path.stem for path in asset_path("policies").glob("*.msgpack")]
+    return {"tasks": sorted(TASKS), "hands": sorted(hands), "policies": sorted(policies)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command `dexsim tasks`, which has no options. Returns its exit code."""
+    for kind, names in catalog().items():
+        print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

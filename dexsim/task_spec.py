@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.control import Control
+from dexsim.control import Control, correct_command
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
-from dexsim.force_loop import correct_command
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings
-from dexsim.touch.estimate import estimate_force
+from dexsim.touch.reduce import estimate_force
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -125,15 +124,8 @@ class TaskSpec(Config):
 def correct_readings(
     spec: TaskSpec, hand: Hand, period: float, readings: Readings, correction: jax.Array | None
 ) -> tuple[Readings, jax.Array]:
-    """Readings whose command is what the force loop shows the policy, and the correction in it.
-
-    Args:
-      spec: of a task with a force loop.
-      hand: the hand.
-      period: s, control tick.
-      readings: one tick, with the user's command.
-      correction: [] of the tick before; None at the start of an episode.
-    """
+    """Readings whose command, the user's before, is what the force loop of `spec` shows the policy, and the correction
+    [] in it. `period` is the control tick in s, `correction` that of the tick before; None at an episode's start."""
     assert spec.finger_force is not None, "checked when the specification was made"
     force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
     before = jnp.zeros(()) if correction is None else correction

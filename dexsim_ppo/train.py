@@ -22,17 +22,16 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 
 if __name__ == "__main__":
-    cli.announce(cli.LOADING)
+    cli.announce_loading()
 
 import dexsim
-from dexsim.catalog import catalog
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.core.files import read_small
 from dexsim.core.install import require
 from dexsim.hand.source import record_of
-from dexsim.registry import find_task, task_option
+from dexsim.registry import catalog, find_task, task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig

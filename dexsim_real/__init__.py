@@ -9,28 +9,17 @@ from typing import TYPE_CHECKING
 from dexsim.core.lazy_loading import lazy_exports
 
 if TYPE_CHECKING:
-    from dexsim_real.control.controller import Controller
-    from dexsim_real.control.limits import SafetyConfig
-    from dexsim_real.control.safety import Safety
-    from dexsim_real.core.errors import HandError
-    from dexsim_real.run.session import RunResult, run_policy
-    from dexsim_real.wire.driver import DriverState, HandDriver, JointTargets
-    from dexsim_real.wire.link import LinkConfig
-    from dexsim_real.wire.serial_hand import SerialHand, open_port
+    from dexsim_real.control.controller import Controller as Controller
+    from dexsim_real.control.limits import SafetyConfig as SafetyConfig
+    from dexsim_real.control.safety import Safety as Safety
+    from dexsim_real.core.errors import HandError as HandError
+    from dexsim_real.run.session import RunResult as RunResult, run_policy as run_policy
+    from dexsim_real.wire.driver import (
+        DriverState as DriverState,
+        HandDriver as HandDriver,
+        JointTargets as JointTargets,
+    )
+    from dexsim_real.wire.link import LinkConfig as LinkConfig
+    from dexsim_real.wire.serial_hand import SerialHand as SerialHand, open_port as open_port
 
-__all__ = [
-    "Controller",
-    "DriverState",
-    "HandDriver",
-    "HandError",
-    "JointTargets",
-    "LinkConfig",
-    "RunResult",
-    "Safety",
-    "SafetyConfig",
-    "SerialHand",
-    "open_port",
-    "run_policy",
-]
-
-__getattr__, __dir__ = lazy_exports(__name__, __all__)
+__all__, __getattr__, __dir__ = lazy_exports(__name__)

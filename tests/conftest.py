@@ -127,7 +127,7 @@ def hand() -> Any:
 def grasp_env() -> Any:
     """The grasp task on C MuJoCo, with imperfect taxels and a small pool (16 starts of each shape)."""
     import dexsim
-    from dexsim.sensing.config import Sensing
+    from dexsim.env.config import Sensing
     from dexsim.sensing.taxels import TaxelSensor
     from dexsim.tasks.grasp.config import GraspConfig
 

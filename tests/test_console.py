@@ -9,8 +9,7 @@ import sys
 import pytest
 from paths import ROOT
 
-from dexsim import __main__ as console
-from dexsim import catalog
+from dexsim import __main__ as console, registry
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
@@ -79,7 +78,7 @@ def test_a_misspelt_option_is_refused_and_the_right_one_named(capsys):
 
 
 def test_the_catalog_lists_what_there_is(capsys):
-    assert catalog.main([]) == 0
+    assert registry.main([]) == 0
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("rotate_clear", "xhand_right (default)", "leap_like", "grasp"))
 

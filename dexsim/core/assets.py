@@ -16,22 +16,17 @@ from dexsim.core.files import write_atomic
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def assets_root() -> Path:
-    """The folder that holds `hand/`, `policies/` and the other assets."""
-    installed = _PACKAGE / "_assets"
-    return installed if installed.is_dir() else _PACKAGE.parent / "assets"
-
-
 def asset_path(name: str) -> Path:
     """Absolute path of an asset, from its name relative to `assets/`, such as `"hand/xhand_right.xml"`.
 
     Raises:
       AssetError: there is no such file or folder.
     """
-    path = assets_root() / name
-    if not path.exists():
-        raise AssetError(f"no asset {name!r} in {assets_root()}")
-    return path
+    installed = _PACKAGE / "_assets"
+    root = installed if installed.is_dir() else _PACKAGE.parent / "assets"
+    if not (root / name).exists():
+        raise AssetError(f"no asset {name!r} in {root}")
+    return root / name
 
 
 def cache_path(name: str) -> Path:

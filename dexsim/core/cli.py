@@ -21,9 +21,6 @@ from dexsim.core.lazy_loading import restore_interrupt
 
 T = TypeVar("T")
 
-LOADING = "loading JAX and MuJoCo"
-"""What `announce` says before the imports of a command that takes seconds over them."""
-
 
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
@@ -68,10 +65,10 @@ def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: s
     return tyro.cli(cls, args=argv, prog=prog, description=description, **kwargs)
 
 
-def announce(text: str) -> None:
-    """Print to standard error what will take seconds; nothing above a help page."""
+def announce_loading() -> None:
+    """Say on standard error what a command's imports will take seconds over; nothing above a help page."""
     if not wants_help(sys.argv):
-        print(text, file=sys.stderr, flush=True)
+        print("loading JAX and MuJoCo", file=sys.stderr, flush=True)
 
 
 def wants_help(argv: Sequence[str]) -> bool:

@@ -112,8 +112,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     for name, field in fields.items():
         if name not in data and field.default is field.default_factory is dataclasses.MISSING:
             raise ConfigError(f"{cls.__name__}.{name} is missing")
-    hints = _hints(cls)
-    return cls(**{name: _convert(hints.get(name), value, f"{cls.__name__}.{name}") for name, value in data.items()})
+    return cls(**data)
 
 
 @contextlib.contextmanager

@@ -6,22 +6,22 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dexsim.core.install import install_line
 
 
-def lazy_exports(package: str, names: Sequence[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """A package's `__getattr__` and `__dir__`, from its `__name__` and its `__all__`. The modules of its late names are
-    those that its source imports them from, for type checkers only."""
+def lazy_exports(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """A package's `__all__`, `__getattr__` and `__dir__`, from its `__name__`. The public names and their modules are
+    those that its source imports under the same name (`Env as Env`), for type checkers only."""
     source = Path(str(sys.modules[package].__file__)).read_text()
     imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
-    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names if alias.asname}
 
     def getattribute(name: str) -> Any:
-        if name not in names:
+        if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         try:
             return getattr(importlib.import_module(homes[name]), name)
@@ -30,7 +30,7 @@ def lazy_exports(package: str, names: Sequence[str]) -> tuple[Callable[[str], An
                 raise
             raise ImportError(f"{package}.{name} needs jax: {install_line('train')}") from None
 
-    return getattribute, lambda: sorted(names)
+    return sorted(homes), getattribute, lambda: sorted(homes)
 
 
 def exit_on_interrupt() -> None:

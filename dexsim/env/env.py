@@ -11,41 +11,42 @@ in `dexsim.env.evaluation`.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
-from dexsim.env.episode import EpisodeSampler
+from dexsim.core.ranges import sample_extreme
 from dexsim.env.motors import JointCommand, Motors, check_timestep
-from dexsim.env.observer import Observer
 from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
-from dexsim.env.touch import TouchModel
-from dexsim.geometry import rotations
+from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.kinematics import HandPose, forward_kinematics
+from dexsim.objects.config import ObjectConfig, load_mesh_object
+from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
+from dexsim.randomization import sample_hand, tilted_down
+from dexsim.sensing.imu import sample_imu
+from dexsim.sensing.taxels import TaxelArray
 from dexsim.task_spec import TaskSpec, correct_readings
+from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals
 
 
 class Env:
     """A task on a hand: `reset(key)`, `step(state, action)`, `restart(state, done)`."""
 
     def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", seed: int = 0):
-        """Compile the scene and fill the pool of start states.
-
-        Args:
-          task: the task with its configuration.
-          hand: the hand.
-          backend: "auto", "c", "cuda" or "mjx".
-          seed: of the pool. Evaluations have pools of their own.
+        """Compile the scene for `backend` ("auto", "c", "cuda" or "mjx") and fill the pool of start states by `seed`;
+        evaluations have pools of their own.
 
         Raises:
           AssetError, ConfigError: see `Physics`, `load_hand`, `check_timestep`.
@@ -58,11 +59,9 @@ class Env:
         self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
-        self.touch = TouchModel(config, hand)
+        self.touch_geometry = touch_geometry(config.objects, config.touch_method)
         self.sensors = SensorSuite(config, hand, task)
-        self.observer = Observer(config, hand, task)
-        self.sampler = EpisodeSampler(config, hand, task, self.sensors)
-        self.observation_layout = self.observer.layout
+        self.observation_layout = self.sensors.layout
         self.control_period = config.physics.control_period
         """One control tick, s."""
         self.pool = task.make_pool(jax.random.key(seed))
@@ -80,7 +79,8 @@ class Env:
         """A new episode from this start state, with the task's goal or the given one: its poses and shape, with the
         object's physical properties, hand and sensors drawn by `key`."""
         key, hand_key, goal_key, noise_key, sensor_key, object_key = jax.random.split(key, 6)
-        episode = self.sampler.sample(hand_key, sensor_key, object_key, start.object, scale)
+        keys = hand_key, sensor_key, object_key
+        episode = sample_episode(self.task, self.hand, self.sensors.taxels, keys, start.object, scale)
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         joints = start.qpos[self.physics.joint_qpos]
@@ -120,7 +120,7 @@ class Env:
 
         command = self._control(state, action)
         law = self.motors.law(hand, command)
-        push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
+        push = self.task.push(push_key, episode.object) + self._tilt_force(episode)
         held, delta = self.task.held(state.goal), hand.pad_thickness_delta
         result = self.physics.advance(law, episode.object, state.physics, push, state.tip_stiffness, delta, held)
         result, finite = revert_if_diverged(result, state.physics, command.valid)
@@ -188,7 +188,7 @@ class Env:
         pose = forward_kinematics(self.hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        touch, normal_force, skin_force = self.touch.compute(pose, object, position, rotation, force, delta)
+        touch, normal_force, skin_force = self._feel(pose, object, (position, rotation), force, delta)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -208,14 +208,33 @@ class Env:
             last_action=last_action,
         )
 
-    def _observe(
+    def _feel(
         self,
-        key: jax.Array,
-        episode: Episode,
-        command: JointCommand,
-        goal: Any,
-        truth: GroundTruth,
-        last: State | None,
+        pose: HandPose,
+        object: ObjectParams,
+        place: tuple[jax.Array, jax.Array],
+        force: jax.Array,
+        pad_thickness_delta: jax.Array,
+    ) -> tuple[Touch, jax.Array, jax.Array]:
+        """What the fingertips feel of an object at `place` (position [3] m, rotation [3, 3]) that presses with `force`
+        [F, 3] N, palm frame: depths and forces of the taxels; the part [F] N of `force` that presses into the skin; the
+        force [F] N, by the skin's law, for the contact's springs."""
+        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
+        geometry = self.touch_geometry(object)
+        touch = compute_touch(hand, pose, geometry, *place, length(force), skin, pad_thickness_delta)
+        # In the links' frames, where the normals are constants.
+        local = rotations.rotate_inverse(pose.tip_rotation, force)
+        pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
+        normal = jnp.sum(pressed.force, -1)
+        touch = pressed if skin.total == "pressing" else touch
+        if self.config.touch_method == "closed_form" and skin.margin == thickness:
+            return touch, normal, jnp.sum(touch.skin_force, -1)  # the springs' geometry and rubber
+        delta = jnp.maximum(pad_thickness_delta, -thickness)  # the solver's
+        bearing = compute_touch(hand, pose, object.shape(), *place, jnp.ones(hand.num_fingers), skin, delta)
+        return touch, normal, jnp.sum(bearing.skin_force, -1)
+
+    def _observe(
+        self, key: jax.Array, episode: Episode, command: JointCommand, goal: Any, truth: GroundTruth, last: State | None
     ) -> dict[str, Any]:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
@@ -235,7 +254,7 @@ class Env:
             "readings": readings,
             "taxel_memory": taxel_memory,
             "correction": correction,
-            "obs": self.observer.observe(readings, truth, shown),
+            "obs": self.sensors.observe(readings, truth, shown),
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }
@@ -245,6 +264,68 @@ class Env:
         joints, place = last.physics.qpos[self.physics.joint_qpos], last.physics.qpos[self.physics.object_qpos]
         quat = place[3:] / jnp.linalg.norm(place[3:])
         return SensorInput(joints, last.joint_torque, last.taxel_force, place[:3], quat)
+
+    def _tilt_force(self, episode: Episode) -> jax.Array:
+        """The object's share [3] N of a tilted gravity; the links' share is small and left out."""
+        weight = float(np.linalg.norm(self.task.gravity))  # m/s^2
+        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
+        return episode.object.mass * weight * (tilted_down(down, episode.hand.tilt) - jnp.asarray(down))
+
+
+def sample_episode(
+    task: Task,
+    hand: Hand,
+    taxels: TaxelArray,
+    keys: tuple[jax.Array, jax.Array, jax.Array],
+    object: ObjectParams,
+    scale: jax.Array | None = None,
+) -> Episode:
+    """What an episode draws at its start: the hand, the object's properties, the IMU and the taxels.
+
+    Args:
+      keys: of the hand, of the sensors, and of the object's physical properties.
+      object: of the start state. Its shape stays, for the state was chosen for it; the physical properties that the
+        task draws (`Task.object_ranges`) are drawn anew.
+      scale: [] in [0, 1], narrows every range about nominal; None for 1.
+    """
+    hand_key, sensor_key, object_key = keys
+    config, ranges, period = task.config, task.config.randomization, task.config.physics.control_period
+    if drawn := tuple(name.removeprefix("objects.") for name in task.object_ranges):
+        object = resample_properties(object_key, object, config.objects, task.unit_inertia(object), drawn)
+    if scale is not None:
+        object = toward_nominal(object, config.objects, task.unit_inertia(object), scale)
+    width = 1.0 if scale is None else scale
+    times = {"timestep": config.physics.timestep, "control_period": period}
+    extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
+    return Episode(
+        hand=sample_hand(hand_key, ranges, hand, **times, scale=width),
+        object=object,
+        imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
+        taxels=taxels.sample(jax.random.fold_in(sensor_key, 1), width),
+    )
+
+
+def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:
+    """A pure function from one episode's object to its geometry, as `dexsim.geometry.distance` takes it.
+
+    The method is closed_form (the solver's primitives), grid (the mesh, baked) or surface_points (points on the mesh,
+    or on the primitives at their drawn sizes).
+
+    Raises:
+      AssetError: the mesh cannot be baked.
+      ConfigError: a grid of primitives, whose sizes are drawn anew in every episode.
+    """
+    if method == "closed_form":
+        return ObjectParams.shape
+    if not config.mesh:
+        if method == "grid":
+            raise ConfigError("touch_method = 'grid': needs ObjectConfig.mesh; or choose closed_form or surface_points")
+        return lambda object: surface_points.from_shape(object.shape())
+    mesh_object = load_mesh_object(config)
+    module: Any = grid if method == "grid" else surface_points
+    with jax.ensure_compile_time_eval():
+        geometry = grid.bake(mesh_object.mesh) if method == "grid" else surface_points.from_mesh(mesh_object.mesh)
+    return lambda object: module.scaled(geometry, object.size[0, 0] / mesh_object.boxes.size[0, 0])
 
 
 def _common_metrics(

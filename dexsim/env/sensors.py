@@ -1,16 +1,19 @@
-"""Between the truth and the host: latency, noise, counts, and what a sensor remembers."""
+"""Between the truth and what is seen of it: latency, noise, counts, what a sensor remembers, and the observations."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim import observation
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Episode, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
-from dexsim.observation import Readings
+from dexsim.observation import Motion, Readings
 from dexsim.randomization import tilted_down
 from dexsim.sensing.imu import measure_orientation
 from dexsim.sensing.taxels import TaxelArray, TaxelMemory
@@ -28,13 +31,16 @@ class SensorInput:
 
 
 class SensorSuite:
-    """From `SensorInput` to `Readings`. Pure methods, for one environment."""
+    """From the truth to `Readings`, and to what actor and critic observe. Pure methods, for one environment."""
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
         self.taxels = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
+        critic = dataclasses.replace(config.observation, leave_out=())  # it may always look
+        self._views = {"actor": config.observation, "critic": critic}
+        self.layout = {group: observation.layout(hand, task.fields[group], self._views[group]) for group in self._views}
 
     def input(self, truth: GroundTruth) -> SensorInput:
         """What the sensors see after a tick."""
@@ -51,18 +57,13 @@ class SensorSuite:
         last_action: jax.Array,
         last: State | None = None,
     ) -> tuple[Readings, TaxelMemory]:
-        """What the host gets to know.
+        """What the host gets to know, and what the taxels remember.
 
         Args:
-          key: of the noise.
-          episode: the hand, the IMU and the taxels.
           now, before: what the sensors see, and saw a tick ago.
           goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
           last_action: [J], the action that led here, as observations show it.
           last: the state one tick ago; None at the start of an episode.
-
-        Returns:
-          The readings, and what the taxels remember.
         """
         sensing, hand = self.config.sensing, episode.hand
         age = hand.sensing_latency
@@ -77,10 +78,7 @@ class SensorSuite:
         memory = self.taxels.init() if last is None else last.taxel_memory
         memory, taxels = self.taxels.apply(episode.taxels, memory, keys[2], late.taxel_force, hand.taxel_gain)
         position, velocity = self._read_place(keys[3], late, last)
-        past = last_action, last_action
-        if last is not None:
-            past = last.readings.last_action, last.readings.past_actions[0]
-        command, goal_quat = goal
+        past = (last_action,) * 2 if last is None else (last.readings.last_action, last.readings.past_actions[0])
         readings = Readings(
             joint_position=joints,
             joint_torque=torque,
@@ -88,13 +86,36 @@ class SensorSuite:
             object_position=position,
             object_velocity=velocity,
             object_quat=self._read_orientation(keys[4], now, before, episode, last),
-            goal_quat=goal_quat,
-            command=command,
+            goal_quat=goal[1],
+            command=goal[0],
             last_action=last_action,
             past_actions=jnp.stack(past),
             palm_gravity=self._palm_gravity(episode),
         )
         return readings, memory
+
+    def observe(
+        self, readings: Readings, truth: GroundTruth, goal: tuple[jax.Array, jax.Array]
+    ) -> dict[str, jax.Array]:
+        """The observation vectors by group: the actor's of the readings; the critic's, of the same fields and more, of
+        the truth and of the goal as `Task.goal_readings` gives it."""
+        true = dataclasses.replace(
+            readings,
+            joint_position=truth.joint_position,
+            joint_torque=truth.joint_torque / self.hand.torque_limit,
+            taxel_force=truth.touch.force,
+            object_position=truth.object_position,
+            object_velocity=truth.object_velocity,
+            object_quat=truth.object_quat,
+            command=goal[0],
+            goal_quat=goal[1],
+        )
+        motion, fields, views = Motion(truth.joint_velocity, truth.object_spin), self.task.fields, self._views
+        return {
+            # Its pose follows from measured angles, which are not the true ones.
+            "actor": observation.observe(self.hand, readings, fields["actor"], views["actor"], motion),
+            "critic": observation.observe(self.hand, true, fields["critic"], views["critic"], motion, truth.pose),
+        }
 
     def _palm_gravity(self, episode: Episode) -> jax.Array:
         """Where gravity [3] points, by an IMU whose frame the object's pose at rest has aligned, with that error."""

@@ -18,6 +18,7 @@ from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.hand.kinematics import HandPose
 from dexsim.objects import params
+from dexsim.objects.config import KINDS, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import FIELDS
 from dexsim.task_spec import TurnSpec
@@ -88,11 +89,13 @@ class Task(abc.ABC):
     """Length of an evaluation episode, control ticks."""
     evaluation: str
     """What `summarize` is given: "series" or "totals"."""
-    object_ranges: tuple[str, ...]
-    """Paths in `config` of the ranges that `sample_object` draws from. Those of `PROPERTY_RANGES`, as "objects.mass",
-    are drawn anew at every episode start; the others stay as the pool has them."""
     config: EnvConfig
     """An `EnvConfig` or a subclass with settings of the task's own."""
+    object_ranges: tuple[str, ...] = tuple(f"objects.{name}" for name in PROPERTY_RANGES)
+    """Ranges of physical properties, as "objects.mass", that are drawn anew at every episode start; the others, and
+    sizes, stay as the pool has them."""
+    shape_names: tuple[str, ...] = KINDS
+    """What `ObjectParams.shape_index` counts."""
     posture: tuple[float, ...] = ()
     """rad, joint angles [J] that an episode on a hand starts from; empty: from wherever the hand is."""
     turn: TurnSpec | None = None
@@ -113,7 +116,6 @@ class Task(abc.ABC):
         """One object.
 
         Args:
-          key: of this object.
           config: a configuration of this task, whose ranges may be others than `self.config`'s.
           shape_index: [] int32 into `dexsim.objects.config.SHAPES`; None for any that the task has.
         """
@@ -133,17 +135,14 @@ class Task(abc.ABC):
 
     def goal_readings(self, goal: Any) -> tuple[jax.Array, jax.Array]:
         """What readings carry of the goal: grip command [] in [0, 1], and the object's goal orientation [4]."""
-        del goal
         return jnp.zeros(()), jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         """Force [3] N on the object's centre of mass during the next tick; zeros for none."""
-        del key, object
         return jnp.zeros(3)
 
     def held(self, goal: Any) -> jax.Array | None:
         """Whether [] bool somebody holds the object where it is during the next tick; None for never."""
-        del goal
         return None
 
     @abc.abstractmethod
@@ -165,12 +164,10 @@ class Task(abc.ABC):
 
     def target_force(self, goal: Any) -> jax.Array:
         """Force [] N that each finger is asked for; it is shown in pictures only. Zero for none."""
-        del goal
         return jnp.zeros(())
 
     def turns(self, goal: Any) -> jax.Array | None:
         """Goals [] int32 reached since the episode began, for pictures of a task with `turn`."""
-        del goal
         return None
 
     @abc.abstractmethod
@@ -178,7 +175,6 @@ class Task(abc.ABC):
         """The episodes of an evaluation.
 
         Args:
-          count: how many.
           shape_index: [P] of the objects in the evaluation's pool.
 
         Returns:

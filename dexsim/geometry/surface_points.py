@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.geometry import mesh as meshes
-from dexsim.geometry import sdf
+from dexsim.geometry import mesh as meshes, sdf
 
 COUNT = 1024
 """Points of a mesh, or of each primitive of a union."""

@@ -19,8 +19,7 @@ from scipy.optimize import minimize
 
 from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import AssetError
-from dexsim.geometry import mesh as meshes
-from dexsim.geometry import rotations, sdf
+from dexsim.geometry import mesh as meshes, rotations, sdf
 
 _VERSION = 3  # of the files in the cache
 _VOXELS = 28  # along the longest side

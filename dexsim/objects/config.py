@@ -22,12 +22,8 @@ SHAPES = tuple(_SLOTS_OF)
 KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
-SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
 PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
-RANGES = (*SIZE_RANGES, *PROPERTY_RANGES)
-"""Fields of `ObjectConfig` that are drawn for every object."""
-MESH_RANGES = ("mesh_size", *PROPERTY_RANGES)
-"""Those of a mesh."""
+"""Ranges of `ObjectConfig` that are drawn anew at every episode start."""
 SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -92,11 +88,6 @@ class ObjectConfig(Config):
     def kinds(self) -> tuple[str, ...]:
         """Names in KINDS of what is drawn."""
         return ("mesh",) if self.mesh else self.shapes
-
-    @property
-    def ranges(self) -> tuple[str, ...]:
-        """Fields that are drawn for every object."""
-        return MESH_RANGES if self.mesh else RANGES
 
     @property
     def slots(self) -> tuple[str, ...]:

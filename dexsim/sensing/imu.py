@@ -73,8 +73,7 @@ def measure_orientation(
 
     Args:
       tick: [] control ticks since the sensor was switched on.
-      now, before: [4] true orientation at this tick and the one before.
-      held: [4] the last reading.
+      now, before, held: [4] true orientation at this tick and the one before, and the last reading.
       up: [3] the vertical in the palm frame, about which the heading drifts.
       control_period: s.
     """

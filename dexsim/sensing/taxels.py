@@ -87,15 +87,9 @@ class TaxelArray:
         sensor, each, finger = self.sensor, self.shape, (self.fingers, 1)
         keys = dict(zip((*DRAWN, "time", "alive", "phase"), jax.random.split(key, len(DRAWN) + 3), strict=True))
         params: TaxelParams = {}
-        for name, nominal, shape in (
-            ("hysteresis", 0.0, finger),
-            ("crosstalk", 0.0, finger),
-            ("gain", 1.0, each),
-            ("bias", 0.0, each),
-            ("drift", 0.0, finger),
-            ("dead", 0.0, ()),
-        ):
+        for name in DRAWN[:-1]:
             if (span := getattr(sensor, name)) is not None:
+                shape, nominal = {"gain": each, "bias": each, "dead": ()}.get(name, finger), float(name == "gain")
                 params[name] = nominal + scale * (_uniform(keys[name], span, shape) - nominal)
         if "hysteresis" in params:
             params["memory"] = jnp.exp(-self.control_period / _uniform(keys["time"], sensor.hysteresis_time, finger))

@@ -11,8 +11,6 @@ import jax.numpy as jnp
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 
-LAWS = ("mooney_rivlin", "linear")
-TOTALS = ("pressing", "solver")
 MATERIALS = {"ecoflex_00_30": 7.6e3, "dragon_skin_30": 96e3, "sortaclear_40": 143e3, "rtv615": 176e3}
 """C10 [Pa] of silicones, C01 held at 0: fitted to the tensile tests of the Soft-Robotics-Materials-Database (Marechal
 et al. 2021) up to a strain of 0.5. A fit of both terms to tension alone makes C01 negative, and the skin soften when
@@ -37,9 +35,9 @@ class Skin(Config):
     lattice. `PhysicsConfig.pad_thickness` is the same distance for the solver."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
-    law: str = setting("mooney_rivlin", choices=LAWS)
+    law: str = setting("mooney_rivlin", choices=("mooney_rivlin", "linear"))
     """linear: the slope at small strain throughout (Winkler's elastic foundation)."""
-    total: str = setting("pressing", choices=TOTALS)
+    total: str = setting("pressing", choices=("pressing", "solver"))
     """Which part of the physics' contact force a finger's taxels share: what presses into the skin, which is all
     that a one-axis taxel feels (pressing), or the magnitude with friction (solver), as in the paper."""
 

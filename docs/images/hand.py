@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import dexsim
-from dexsim.force_loop import commanded_force
+from dexsim.control import commanded_force
 from dexsim.hand.description import Hand
 from dexsim.hand.mjcf import hand_poses
 from dexsim.render.camera import look

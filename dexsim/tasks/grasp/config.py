@@ -2,10 +2,9 @@
 
 import dataclasses
 
-from dexsim.control import Control
+from dexsim.control import Control, ForceLoop
 from dexsim.core.config import Config, Range, setting
 from dexsim.env.config import EnvConfig
-from dexsim.force_loop import ForceLoop
 from dexsim.touch.skin import Skin
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from dexsim.control import target_force
 from dexsim.core.statistics import entry, interval, mean, proportion
-from dexsim.force_loop import target_force
 from dexsim.objects.config import KINDS
 
 SETTLE = 3.0  # s after release from which forces count

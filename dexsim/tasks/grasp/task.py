@@ -14,24 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim import observation
-from dexsim.control import closing
+from dexsim.control import commanded_force, target_force
 from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import uniforms
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
-from dexsim.force_loop import commanded_force, target_force
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
-from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
-from dexsim.tasks.placement import clearance, close_fingers, palm_height
-from dexsim.tasks.terms import action_rate, joint_speed, random_push
+from dexsim.tasks.shared import action_rate, clearance, close_fingers, joint_speed, palm_height, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
@@ -52,7 +49,7 @@ class GraspGoal:
 
     command: jax.Array  # [] in [0, 1]
     fixed: jax.Array  # [] bool, the command never changes (evaluation)
-    delay: jax.Array | None = None  # [] s until the object is let go
+    delay: jax.Array  # [] s until the object is let go
 
 
 def tailed_gaussian(error: jax.Array, sigma: float, tail: float) -> jax.Array:
@@ -93,8 +90,6 @@ class Grasp(Task):
     evaluation = "series"
     fields: dict[str, tuple[str, ...]] = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
-    shape_names = KINDS
-    """What `ObjectParams.shape_index` counts."""
 
     config: GraspConfig
     finger_force: tuple[float, float]
@@ -108,8 +103,7 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
-        self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
-        self._roots, self._closing = hand.root_joint, closing(hand)
+        self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
@@ -194,25 +188,21 @@ class Grasp(Task):
         return self.config.objects.kinds
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
-        del start
-        goal = GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
         low, high = self.config.release_delay
-        if high == 0:
-            return goal
-        return dataclasses.replace(goal, delay=jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high))
+        delay = jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high)
+        return GraspGoal(jax.random.uniform(key), jnp.zeros((), bool), delay)
 
     def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
-        del truth
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, _COMMAND_CHANGE) & ~goal.fixed
         return dataclasses.replace(
             goal,
             command=jnp.where(change, jax.random.uniform(what), goal.command),
-            delay=None if goal.delay is None else goal.delay - self.config.physics.control_period,
+            delay=goal.delay - self.config.physics.control_period,
         )
 
-    def held(self, goal: GraspGoal) -> jax.Array | None:
-        return None if goal.delay is None else goal.delay > 0
+    def held(self, goal: GraspGoal) -> jax.Array:
+        return goal.delay > 0
 
     def goal_readings(self, goal: GraspGoal) -> tuple[jax.Array, jax.Array]:
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -221,11 +211,9 @@ class Grasp(Task):
         return target_force(goal.command, self.finger_force)
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        chance, speed = self.config.push_probability, self.config.push_speed
-        return random_push(key, object.mass, probability=chance, speed=speed, period=self.config.physics.control_period)
+        return random_push(key, object.mass, self.config)
 
     def dropped(self, goal: GraspGoal, truth: GroundTruth) -> jax.Array:
-        del goal
         away = length(truth.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 
@@ -235,7 +223,7 @@ class Grasp(Task):
         force = length(truth.finger_force)
         contact = force > _CONTACT
         target = self.target_force(goal)
-        torque = truth.joint_torque[self._roots] * self._closing
+        torque = truth.joint_torque[self._roots]  # positive closes the finger; `dexsim check-hand` checks it
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers, too_much = self._finger_joints, jnp.maximum(force[1:] - (target + _MARGIN), 0.0)
@@ -254,23 +242,17 @@ class Grasp(Task):
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "drop": weights.drop * fallen,
         }
-        metrics = {f"reward/{name}": value for name, value in terms.items()}
-        return jnp.asarray(sum(terms.values())), metrics | self._metrics(goal, truth, held)
-
-    def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
-        force = length(truth.finger_force)
-        contact = force > _CONTACT
         parts = {"force": force, "normal": truth.normal_force, "taxels": jnp.sum(truth.touch.force, -1)}
         commanded = {f"finger_{name}": commanded_force(part, contact) for name, part in parts.items()}
-        return {
+        pull = jnp.where(contact, jnp.abs(torque), 0.0)
+        return jnp.asarray(sum(terms.values())), {
+            **{f"reward/{name}": value for name, value in terms.items()},
             "success": held,
             "command": goal.command,
-            "force_error": jnp.abs(commanded["finger_force"] - self.target_force(goal)),
+            "force_error": jnp.abs(commanded["finger_force"] - target),
             **commanded,
             "total_force": jnp.sum(force),
-            "total_torque": jnp.sum(
-                jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
-            ),
+            "total_torque": jnp.sum(pull / self._max_torque),
             "touching": jnp.sum(contact).astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
@@ -290,11 +272,9 @@ class Grasp(Task):
             of_shape = np.flatnonzero(shape_index == shape)
             mine = target == shape
             index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
-        goal = GraspGoal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
-        if self.config.release_delay[1] > 0:
-            delay = np.random.default_rng(0).uniform(*self.config.release_delay, count)
-            goal = dataclasses.replace(goal, delay=jnp.asarray(delay, jnp.float32))
-        return index, goal
+        commands = jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32)
+        delay = np.random.default_rng(0).uniform(*self.config.release_delay, count)
+        return index, GraspGoal(commands, jnp.ones(count, bool), jnp.asarray(delay, jnp.float32))
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""

@@ -1,11 +1,12 @@
-"""Start states of the rotation task: objects that came to rest in random postures of the hand.
+"""Objects of the rotation task (a cube, a box of three edges, an upright cylinder, or a mesh) and its start states:
+objects that came to rest in random postures of the hand.
 
 Settling runs in C MuJoCo on the host's cores, once: the pool is kept on disk under the hash of the hand's files and the
 configuration.
 """
 
+import dataclasses
 import functools
-import hashlib
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -19,17 +20,20 @@ import numpy as np
 from dexsim.core.assets import cached_arrays
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import Array
+from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
-from dexsim.objects.config import load_mesh_object
-from dexsim.objects.params import ObjectParams
+from dexsim.objects.config import INACTIVE_SIZE, SHAPES, load_mesh_object
+from dexsim.objects.params import ObjectParams, extent, sample_object, unit_inertia
 from dexsim.physics import contact
 from dexsim.physics.model import build_scene, tip_bodies
-from dexsim.tasks.placement import clearance, close_fingers, palm_height
-from dexsim.tasks.rotate.objects import CLEARANCE, largest_size, lowest_point, sample_turned_object, slots
+from dexsim.tasks.shared import clearance, close_fingers, palm_height
 
+CLEARANCE = 0.001  # m, smallest gap between palm and object with support "fingers"
+_Z_TO_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 _TRIALS = 300  # rounds of candidates in which every object should find a posture
 _VERSION = 5  # of the procedure: raise it when older pools no longer hold
 _SETTLING = 0.8  # s, for start states to come to rest; those that do not are discarded
@@ -43,6 +47,68 @@ _UNUSED = (
 """Settings that no start state depends on; what does of `turn` and `randomization` is named in `_fingerprint`."""
 _TRAPS = 128  # different starts in the trap; few candidates stay there
 _TRAP_PITCH, _TRAP_PLACE = (0.35, 0.9), 0.017  # rad toward the wrist; m from the reference toward the fingertips
+
+
+def largest_size(config: Any) -> np.ndarray:
+    """Upper bound [K, 3] m of the size of each primitive that the object consists of."""
+    if config.objects.mesh:
+        return config.objects.largest
+    half = config.edge[1] / 2 * config.proportions[1]
+    size = {"box": [half, half, half], "cylinder": [half, half, 0.0]}
+    return np.array([size[slot] for slot in config.objects.slots])
+
+
+def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
+    """Draw one object."""
+    if config.objects.mesh:
+        return sample_object(key, config.objects)
+    edge_key, base_key, scale_key = jax.random.split(key, 3)
+    shape_key, proportion_key = jax.random.split(jax.random.fold_in(key, 1))
+    shapes = jnp.array([SHAPES.index(name) for name in config.objects.shapes], jnp.int32)
+    base = sample_object(base_key, config.objects, jax.random.choice(shape_key, shapes))
+    extreme = sample_extreme(base_key, config.objects.extremes)  # the one that `sample_object` draws
+    half = uniform(edge_key, config.edge, extreme) / 2
+    half = half * uniform(proportion_key, config.proportions, extreme, (3,))
+    solid = base.mass * uniform(scale_key, config.objects.inertia_scale, extreme)
+    stand, kinds = upright(config.turn.unit_axis), config.objects.slots
+    active = jnp.array([SHAPES.index(kind) for kind in kinds]) == base.shape_index
+    # Slots lie along the object's axes; the axis of a cylinder, z, is the palm's normal, x.
+    sizes = {"box": half, "cylinder": jnp.stack([half[1], half[0], jnp.zeros(())])}
+    turned = {"box": (1.0, 0.0, 0.0, 0.0) if stand is None else stand, "cylinder": _Z_TO_X}
+    object = dataclasses.replace(
+        base,
+        size=jnp.where(active[:, None], jnp.stack([sizes[kind] for kind in kinds]), INACTIVE_SIZE),
+        position=jnp.zeros((len(kinds), 3)),
+        active=active,
+        quat=None if kinds == ("box",) and stand is None else jnp.array([turned[kind] for kind in kinds], jnp.float32),
+        kinds=kinds,
+    )
+    return dataclasses.replace(object, inertia=solid * solid_inertia(object))
+
+
+def upright(axis: np.ndarray) -> np.ndarray | None:
+    """The shortest turn [4] that takes x to this unit vector, on which a face of a cube stands; None for x."""
+    if axis[0] > 1 - 1e-9:
+        return None
+    if axis[0] < -1 + 1e-9:
+        return np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+    half = np.array([1 + axis[0], 0.0, -axis[2], axis[1]])  # (1 + x . axis, x cross axis)
+    return (half / np.linalg.norm(half)).astype(np.float32)
+
+
+def solid_inertia(object: ObjectParams) -> jax.Array:
+    """Inertia [3] m^2 about its axes of a uniform box, or cylinder along x, of 1 kg."""
+    inertia = unit_inertia(object)  # of a cylinder along z
+    if "cylinder" not in object.kinds:
+        return inertia
+    return jnp.where(object.active[object.kinds.index("cylinder")], inertia[::-1], inertia)
+
+
+def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Array:
+    """Smallest coordinate [] m of the object along the palm's normal (x)."""
+    down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
+    reach = extent(object.size, object.position, object.active, down, object.kinds, object.quat)
+    return position[0] - reach
 
 
 def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
@@ -73,12 +139,10 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     settings = {name: value for name, value in to_dict(config).items() if name not in _UNUSED}
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
     turn = config.turn.axis, config.turn.distance
-    given = [settings, motors, turn, hand.digest, np.asarray(jax.random.key_data(key)).tolist()]
     boxes = load_mesh_object(config.objects).boxes if config.objects.mesh else None
-    files = hashlib.sha256(hand.model_path.read_bytes())
-    for part in (boxes.size, boxes.position, boxes.quat) if boxes else ():
-        files.update(part.tobytes())
-    return f"{json.dumps(given, sort_keys=True)} {files.hexdigest()} {_VERSION} {mujoco.__version__}"
+    mesh = [part.tolist() for part in (boxes.size, boxes.position, boxes.quat)] if boxes else None
+    given = settings, motors, turn, mesh, hand.digest, np.asarray(jax.random.key_data(key)).tolist()
+    return json.dumps([*given, _VERSION, mujoco.__version__], sort_keys=True)
 
 
 def _make(
@@ -183,7 +247,7 @@ def _at(
 
 def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
     """The scene in C, with springs at the joints for the motors."""
-    model = build_scene(hand, slots(config), largest_size(config), config.physics, gravity, "mjx").model
+    model = build_scene(hand, config.objects.slots, largest_size(config), config.physics, gravity, "mjx").model
     dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
     model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping

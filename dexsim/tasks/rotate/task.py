@@ -23,21 +23,18 @@ from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
-from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
-from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.objects import (
+from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import (
     CLEARANCE,
     largest_size,
+    load_pool,
     lowest_point,
     sample_turned_object,
-    slots,
     solid_inertia,
 )
-from dexsim.tasks.rotate.report import summarize
-from dexsim.tasks.rotate.start import load_pool
-from dexsim.tasks.terms import action_rate, joint_speed, random_push
+from dexsim.tasks.shared import action_rate, joint_speed, palm_height, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
 _EPSILON, _STEEPNESS = 0.1, 400.0  # rad and 1/m, of the paper's reward
@@ -110,8 +107,6 @@ class Rotate(Task):
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
-    shape_names = KINDS
-    """What `ObjectParams.shape_index` counts."""
 
     config: RotateConfig
 
@@ -124,9 +119,7 @@ class Rotate(Task):
         self.config, self.hand, self.posture = config, hand, posture
         self._placed = placed = config.placed_on(hand)
         self.turn = placed.turn
-        self.slots, self.largest = slots(config), largest_size(config)
-        drawn = ("edge", "proportions", *(f"objects.{name}" for name in PROPERTY_RANGES))
-        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
+        self.slots, self.largest = config.objects.slots, largest_size(config)
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
@@ -144,7 +137,6 @@ class Rotate(Task):
 
     def sample_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`; there is only one kind."""
-        del shape_index
         return sample_turned_object(key, config.placed_on(self.hand))
 
     def unit_inertia(self, object: ObjectParams) -> jax.Array:
@@ -154,9 +146,7 @@ class Rotate(Task):
         return solid_inertia(object)
 
     def begin(self, key: jax.Array | None, start: Start | None) -> RotateGoal:
-        del key, start
-        zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-        fingers = jnp.zeros(self.hand.num_fingers)
+        zero, none, fingers = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros(self.hand.num_fingers)
         return RotateGoal(
             turns=none,
             entered=jnp.zeros((), bool),
@@ -181,9 +171,7 @@ class Rotate(Task):
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
     def update(self, key: jax.Array | None, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
-        del key  # nothing here is random
-        now, period = self.progress(goal, truth), self._period
-        touching = self._touching(truth)
+        now, period, touching = self.progress(goal, truth), self._period, self._touching(truth)
         clock = goal.clock + period
         change = {
             "spin": now.spin,
@@ -212,8 +200,7 @@ class Rotate(Task):
         return goal.turns
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
-        chance, speed = self.config.push_probability, self.config.push_speed
-        return random_push(key, object.mass, probability=chance, speed=speed, period=self._period)
+        return random_push(key, object.mass, self.config)
 
     def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         away = length(truth.object_position - jnp.asarray(self.reference))
@@ -228,11 +215,9 @@ class Rotate(Task):
         self, goal: RotateGoal, truth: GroundTruth, dropped: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
-        weights, now = self.config.reward, self.progress(goal, truth)
+        weights, now, after = self.config.reward, self.progress(goal, truth), self.update(None, goal, truth)
         fallen = dropped.astype(jnp.float32)
-        held = 1.0 - fallen
-        after = self.update(None, goal, truth)
-        work = tips_at_work(after.duty)
+        held, work = 1.0 - fallen, tips_at_work(after.duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= _FROM_GOAL).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))

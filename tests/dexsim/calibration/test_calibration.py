@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from virtual_press import Motor, press, varied_presses
 
 from dexsim.calibration.fit import JointPress, calibrate, fit_joint

@@ -7,8 +7,7 @@ import typing
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from dexsim.core.config import Config, Range, from_dict, override, setting, to_dict
 from dexsim.core.errors import ConfigError

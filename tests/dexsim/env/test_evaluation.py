@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.episode import EpisodeSampler
+from dexsim.env.env import sample_episode
 from dexsim.env.evaluation import Evaluation
 from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Start
@@ -23,10 +23,10 @@ def drawn(hand):
     """What 400 episodes draw for each of eight boxes, of which some are extreme: the object, leaves [8, 400, ...]."""
     config, box = GraspConfig(objects=ObjectConfig(extremes=0.5)), jnp.int32(SHAPES.index("box"))
     task = Grasp(config, hand)
-    sampler = EpisodeSampler(config, hand, task, SensorSuite(config, hand, task))
+    taxels = SensorSuite(config, hand, task).taxels
 
     def draw(key, object):
-        return sampler.sample(*jax.random.split(key, 3), object).object
+        return sample_episode(task, hand, taxels, jax.random.split(key, 3), object).object
 
     def episodes(key, keys):
         return jax.vmap(draw, (0, None))(keys, task.sample_object(key, config, box))

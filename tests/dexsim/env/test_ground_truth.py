@@ -10,7 +10,7 @@ import pytest
 from episodes import by_field, ground_truth
 
 from dexsim import observation
-from dexsim.env.observer import Observer
+from dexsim.env.sensors import SensorSuite
 from dexsim.observation import Readings
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import revert_if_diverged
@@ -23,8 +23,8 @@ FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="1
 def observer(grasp_env):
     """Grasp's, whose critic also sees the object's orientation and spin."""
     critic = (*observation.GRASP, "object_orientation", "object_spin")
-    task = SimpleNamespace(fields={"actor": observation.GRASP, "critic": critic})
-    return Observer(grasp_env.config, grasp_env.hand, task)
+    task = SimpleNamespace(fields={"actor": observation.GRASP, "critic": critic}, gravity=(9.81, 0.0, 0.0))
+    return SensorSuite(grasp_env.config, grasp_env.hand, task)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dexsim.env.config import Sensing
 from dexsim.env.sensors import SensorInput, SensorSuite
-from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp

@@ -18,8 +18,7 @@ from paths import ROOT
 
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
-from dexsim.physics import c_backend
-from dexsim.physics import model as scene_model
+from dexsim.physics import c_backend, model as scene_model
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics

@@ -16,8 +16,7 @@ import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand, Motors
-from dexsim.physics import ffi
-from dexsim.physics import physics as engines
+from dexsim.physics import ffi, physics as engines
 from dexsim.physics.cuda import backend, launch, program
 from dexsim.physics.cuda.scene import Buffer, args_type, declare_args
 from dexsim.physics.physics import Physics

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dexsim.env.episode import EpisodeSampler
+from dexsim.env.config import Sensing
+from dexsim.env.env import sample_episode
 from dexsim.env.sensors import SensorSuite
 from dexsim.randomization import Randomization
-from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams, measure_orientation
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.task import Rotate
@@ -70,11 +70,11 @@ def test_an_episodes_imu_is_as_wide_as_the_ranges_and_the_curriculum_together(ha
     def drawn(scale):
         config = RotateConfig(randomization=Randomization(scale=scale))
         task = Rotate(config, hand)
-        sampler = EpisodeSampler(config, hand, task, SensorSuite(config, hand, task))
+        taxels = SensorSuite(config, hand, task).taxels
 
         def draw(curriculum):
             cube = task.sample_object(jax.random.key(2), config)
-            return sampler.sample(*jax.random.split(jax.random.key(1), 3), cube, curriculum).imu
+            return sample_episode(task, hand, taxels, jax.random.split(jax.random.key(1), 3), cube, curriculum).imu
 
         return jax.jit(draw)
 

@@ -18,7 +18,7 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import COMMANDS, Grasp, GraspGoal, command_reward
-from dexsim.tasks.placement import clearance
+from dexsim.tasks.shared import clearance
 from dexsim.touch.taxel_force import Touch
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
@@ -61,7 +61,7 @@ def make_moment(hand, **changes):
 
 
 def goal_of(command):
-    return GraspGoal(jnp.float32(command), jnp.zeros((), bool))
+    return GraspGoal(jnp.float32(command), jnp.zeros((), bool), jnp.zeros(()))
 
 
 class TestTerms:

@@ -21,12 +21,12 @@ from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import forward_kinematics, tip_twist
 from dexsim.physics.config import PhysicsConfig
 from dexsim.task_spec import TurnSpec
-from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate import start
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, any_object, clear_of_palm, paper
-from dexsim.tasks.rotate.objects import lowest_point, sample_turned_object, solid_inertia, upright
 from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import lowest_point, sample_turned_object, solid_inertia, upright
 from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
+from dexsim.tasks.shared import palm_height
 from dexsim.touch.taxel_force import Touch
 
 PERIOD = RotateConfig().physics.control_period

@@ -63,8 +63,7 @@ def test_terminated_and_truncated_apart():
 @pytest.mark.slow
 def test_ppo_runs_on_grasp():
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
-    from brax.training.agents.ppo import networks
-    from brax.training.agents.ppo import train as ppo
+    from brax.training.agents.ppo import networks, train as ppo
 
     history = []
     _, params, _ = ppo.train(

@@ -13,7 +13,7 @@ from dexsim.calibration.maps import (
     torque_constants,
 )
 from dexsim.core.errors import CalibrationError
-from dexsim.touch.estimate import ForceEstimate, estimate_force
+from dexsim.touch.reduce import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.calibrate.press_fit import dead_taxels, fill_dead, fit, read_presses

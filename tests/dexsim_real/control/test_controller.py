@@ -10,22 +10,22 @@ from remembering import remembering
 
 pytest.importorskip("serial")
 from dexsim.control import Control
+from dexsim.env.config import Sensing
 from dexsim.env.env import Env
-from dexsim.env.observer import Observer
+from dexsim.env.sensors import SensorSuite
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.randomization import Randomization
-from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
-from dexsim.tasks.rotate.objects import sample_turned_object
+from dexsim.tasks.rotate.start import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.sensors.camera import ObjectEstimate
@@ -107,8 +107,8 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
     task = task_class(config, hand)
     controller = Controller(Acts(task, hand, lambda observation: rng.uniform(-1, 1, 12).astype(np.float32)), hand)
     sensing = HandSensing(hand, HardwareConfig())
-    # The simulation's door: `Observer`, compiled by itself, on readings and some truth for the critic.
-    observer = Observer(config, hand, task)
+    # The simulation's door: `SensorSuite.observe`, compiled by itself, on readings and some truth for the critic.
+    sensors = SensorSuite(config, hand, task)
 
     def door(readings, goal):
         moment = SimpleNamespace(
@@ -122,7 +122,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
             object_spin=jnp.zeros(3),
         )
         command, goal_quat = task.goal_readings(goal)
-        return observer.observe(readings, moment, (command, goal_quat))["actor"]
+        return sensors.observe(readings, moment, (command, goal_quat))["actor"]
 
     door = jax.jit(door)
     goal = task.begin(jax.random.key(0), None)

@@ -8,8 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from paths import ROOT
 
 from dexsim_real.core.log import _HEAD, MAGIC, SYNC, Kind, LogError, LogReader, LogWriter, encode

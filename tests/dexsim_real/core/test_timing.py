@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from dexsim_real.loop import GRACE, LoopThread, Pace, keep_phase
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig

@@ -17,8 +17,7 @@ from following_hand import FollowingHand, arguments, records
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
-from dexsim_real.run import __main__ as run
-from dexsim_real.run import session, status
+from dexsim_real.run import __main__ as run, session, status
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
 

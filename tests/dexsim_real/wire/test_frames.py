@@ -5,8 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, HOST_REQUESTS, Command, Frame, FrameError, Mode, Parser

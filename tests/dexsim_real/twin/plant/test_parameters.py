@@ -13,7 +13,7 @@ from paths import ROOT
 import dexsim_real.twin.plant
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
-from dexsim.tasks.rotate.objects import CLEARANCE
+from dexsim.tasks.rotate.start import CLEARANCE
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand, referee
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear, nominal_gravity, start_of

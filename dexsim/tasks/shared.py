@@ -1,4 +1,6 @@
-"""Where an object can be put: the palm below it, and how far it is from every link."""
+"""What tasks share: where an object can be put, reward terms on the motion of the hand, pushes on the object."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -54,3 +56,24 @@ def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Arr
     if not gaps:
         raise AssetError(f"{hand.model_path}: no capsule, sphere or box has contype or conaffinity above 0")
     return jnp.min(jnp.stack(gaps))
+
+
+def action_rate(action: jax.Array, last_action: jax.Array) -> jax.Array:
+    """R_action: squared change of the action."""
+    return jnp.sum((action - last_action) ** 2)
+
+
+def joint_speed(velocity: jax.Array) -> jax.Array:
+    """R_vel: squared joint velocity."""
+    return jnp.sum(velocity**2)
+
+
+def random_push(key: jax.Array, mass: jax.Array, config: Any) -> jax.Array:
+    """Force [3] N that acts for a tick, with `config.push_probability`: it changes the velocity of `mass` kg by up to
+    `config.push_speed` m/s in a random direction."""
+    when, where, strength = jax.random.split(key, 3)
+    direction = jax.random.normal(where, (3,))
+    direction = direction / (jnp.linalg.norm(direction) + 1e-9)
+    change = config.push_speed * jax.random.uniform(strength)
+    hit = jax.random.bernoulli(when, config.push_probability)
+    return jnp.where(hit, mass * change / config.physics.control_period, 0.0) * direction
