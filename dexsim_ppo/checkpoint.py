@@ -22,8 +22,6 @@ class Checkpoint:
     """A sound file's content."""
 
     path: Path
-    kind: str
-    """`"train"` (a whole `TrainState`) or `"policy"`."""
     task: str
     content: dict[str, Any]
     """Plain data: configurations, observation layout and the like."""
@@ -32,7 +30,8 @@ class Checkpoint:
 
 
 def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], tree: Any) -> None:
-    """Write a pytree of arrays and what describes it, whole or not at all."""
+    """Write a pytree of arrays and what describes it, whole or not at all; `kind` is `"policy"` or, for a whole
+    `TrainState`, `"train"`."""
     leaves, parts = [], []
     for tree_path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         prng = ""
@@ -66,7 +65,7 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
     for leaf in header["leaves"]:
         if leaf["prng"]:
             leaves[leaf["path"]] = jax.random.wrap_key_data(jnp.asarray(leaves[leaf["path"]]), impl=leaf["prng"])
-    return Checkpoint(Path(path), header["kind"], header["task"], header["content"], leaves)
+    return Checkpoint(Path(path), header["task"], header["content"], leaves)
 
 
 def restore(checkpoint: Checkpoint, like: Tree) -> Tree:

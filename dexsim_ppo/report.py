@@ -11,47 +11,34 @@ def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, 
     """Report of episodes from their metrics [T, N], termination flags [T, N] and starts [N].
 
     An episode lives up to, and not including, its first terminated step, whose reward belongs to the return.
+
+    Returns:
+      "held" (share of episodes never terminated), "return" and "steps_held", each with a 95 % interval by start, their
+      numbers, and "task": what the task's `summarize` makes of its metrics.
     """
     steps, episodes = terminated.shape
     alive = ~np.logical_or.accumulate(terminated, axis=0)
-    steps_held = alive.sum(axis=0)
-    last = np.minimum(steps_held, steps - 1)
-    returns = metrics["return"][last, np.arange(episodes)]
-    # A step that diverges ends the episode: it must be counted although the episode does not survive it.
-    entered = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
-    masked = {name: np.where(entered if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
+    steps_held, starts = alive.sum(axis=0), len(np.unique(start))
+    last = {name: x[np.minimum(steps_held, steps - 1), np.arange(episodes)] for name, x in metrics.items()}
+    if env.evaluation == "totals":
+        own = env.summarize(last, steps_held)
+    else:
+        # A step that diverges ends the episode: it must be counted although the episode does not survive it.
+        entered = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
+        masked = {name: np.where(entered if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
+        own = env.summarize(masked, alive)
+    share = mean_interval(alive[-1], start)
+    if starts == episodes:
+        wilson = statistics.proportion(alive[-1])
+        share = {"value": wilson["mean"], "low": wilson["low"], "high": wilson["high"]}
     return {
         "episodes": episodes,
         "steps": steps,
-        **_intervals(alive[-1], returns, steps_held, start),
-        "task": env.summarize(masked, alive),
-    }
-
-
-def summarize_totals(
-    env: Any, metrics: dict[str, np.ndarray], episode_length: np.ndarray, start: np.ndarray
-) -> dict[str, Any]:
-    """Report of episodes from the metrics of their last tick [N], their lengths [N] in ticks and their starts [N]."""
-    held = episode_length == env.evaluation_steps
-    return {
-        "episodes": int(episode_length.size),
-        "steps": env.evaluation_steps,
-        **_intervals(held, metrics["return"], episode_length, start),
-        "task": env.summarize(metrics, episode_length),
-    }
-
-
-def _intervals(held: np.ndarray, returns: np.ndarray, episode_length: np.ndarray, start: np.ndarray) -> dict[str, Any]:
-    """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
-    starts, share = len(np.unique(start)), mean_interval(held, start)
-    if starts == held.size:
-        wilson = statistics.proportion(held)
-        share = {"value": wilson["mean"], "low": wilson["low"], "high": wilson["high"]}
-    return {
         "starts": starts,
         "held": share | {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)},
-        "return": mean_interval(returns, start),
-        "steps_held": mean_interval(episode_length, start),
+        "return": mean_interval(last["return"], start),
+        "steps_held": mean_interval(steps_held, start),
+        "task": own,
     }
 
 

@@ -96,20 +96,14 @@ class _Worlds:
         # One thread for each core that this process may use.
         self.batch = Batch(scene.model, size, available_cores())
         where = places(scene)
-        self._fields = {name: [(self.batch.expand(name), place)] for name, place in where.items()}
+        self.fields = {name: [(self.batch.expand(name), place)] for name, place in where.items()}
         # The subtree of the object's body is the object.
-        self._fields["body_mass"].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
+        self.fields["body_mass"].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.warmstart = self.batch.bind("qacc_warmstart")
         self.armature = self.batch.expand("dof_armature")
         self.torque, self.wrench = self.batch.bind("qfrc_applied"), self.batch.bind("xfrc_applied")
         self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
-
-    def configure(self, values: list[np.ndarray]) -> None:
-        """Write the models' fields."""
-        for targets, value in zip(self._fields.values(), values, strict=True):
-            for array, where in targets:
-                array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
 
 
 class HostEngine:
@@ -117,7 +111,7 @@ class HostEngine:
 
     def __init__(self, scene: PhysicsScene):
         """`scene` has a contact sensor for each fingertip."""
-        self.scene, self._count = scene, len(places(scene))
+        self.scene = scene
         self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
 
     def tick(self, law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
@@ -135,9 +129,10 @@ class HostEngine:
                     "backend 'c' does not work in a forked process, which lacks its threads: "
                     "start processes with multiprocessing.get_context('spawn')"
                 )
-            worlds.configure(inputs[: self._count])
-            results = self._run(worlds, law, inputs[self._count :])
-            for target, value in zip(out, results, strict=True):
+            for targets, value in zip(worlds.fields.values(), inputs, strict=False):
+                for array, where in targets:
+                    array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
+            for target, value in zip(out, self._run(worlds, law, inputs[len(worlds.fields) :]), strict=True):
                 target[...] = value.reshape(target.shape)
 
     def _run(self, worlds: _Worlds, law: bytes, inputs: list[np.ndarray]) -> list[np.ndarray]:

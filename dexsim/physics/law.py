@@ -1,7 +1,7 @@
 """The motors' law as a list of operations: traced by JAX, evaluated by NumPy, printed as CUDA.
 
 Motors have one source, which JAX traces for every engine. `record` writes the traced law down, so that engines can
-evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `dexsim.physics.cuda.law`. All work
+evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `cuda.program.print_law`. All work
 in the same precision and order; results differ where XLA fuses a product and a sum, by a rounding.
 
 A law works element by element on scalars and on vectors over the joints. So one joint's torque takes one element of

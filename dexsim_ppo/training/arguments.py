@@ -124,12 +124,12 @@ def training_config(arguments: TrainArguments) -> Any:
     return env
 
 
-# What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
-_RESUMABLE = {
+# What a resumed run may be given anew: its budget, what looks on, and where the hand's files are. Everything else is
+# part of the saved state.
+_RESUMABLE = (
     *("checkpoint_every", "devices", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "evaluation_share"),
-    *("keep_checkpoints", "log_every", "minutes", "patience", "steps", "video", "wandb"),
-    "hand",  # where its files are: their content must be the same
-}
+    *("hand", "keep_checkpoints", "log_every", "minutes", "patience", "steps", "video", "wandb"),
+)
 
 
 def check_resumed(arguments: TrainArguments, saved: TrainArguments) -> None:

@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
 
 import dexsim
@@ -137,7 +136,7 @@ class Run:
             if len(calls_s) == 1:
                 self.clock["first_update_s"] = time.perf_counter() - self.started
                 processes.print_on_first(f"first update {self.clock['first_update_s']:.1f} s after the start")
-            faults.check(metrics, iteration)
+            faults.check(int(metrics["skipped_updates"][-1]), iteration)
             rate = per_call * per_iteration / calls_s[-1]
             row = means(metrics) | {
                 "iteration": iteration,
@@ -223,7 +222,8 @@ class Run:
         self.without_better = 0 if better else self.without_better + 1
         if better:
             self.best = {"return": score, "iteration": iteration}
-            self._write_policy(policy, self.folder.best)
+            if processes.is_first():
+                policy.save(self.folder.best)
         processes.print_on_first(
             f"evaluation at iteration {iteration}: {first} {written(entries[first])}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
@@ -245,14 +245,10 @@ class Run:
                 "progress": {"best": self.best, "seconds": self._seconds(), "without_better": self.without_better},
             },
         )
-        self._write_policy(policy, policy_of(path))
-        self._write_policy(policy, self.folder.last)
         if processes.is_first():
+            policy.save(policy_of(path))
+            policy.save(self.folder.last)
             self.folder.prune(self.arguments.keep_checkpoints)
-
-    def _write_policy(self, policy: Policy, path: Path) -> None:
-        if processes.is_first():
-            policy.save(path)
 
     @property
     def selected(self) -> Path:
@@ -308,27 +304,18 @@ class Faults:
     def __init__(self, config: PPOConfig, folder: RunFolder, state: TrainState):
         self._per_call = config.iterations_per_call * config.epochs * config.minibatches
         self._folder, self._skipped, self._sound = folder, int(state.skipped_updates), int(state.iteration)
-        self._bad_calls, self._faulty = 0, False
+        self._bad_calls = 0
 
-    def check(self, metrics: dict[str, np.ndarray], iteration: int) -> None:
-        """Say when updates begin to be skipped.
-
-        Raises:
-          DexsimError: most updates of several calls in a row were skipped.
-        """
-        skipped, known = int(metrics["skipped_updates"][-1]), self._faulty
+    def check(self, skipped: int, iteration: int) -> None:
+        """Raises DexsimError: most updates of several calls in a row were `skipped`, which counts all of the run's."""
         lost, self._skipped = skipped - self._skipped, skipped
-        self._faulty, self._bad_calls = lost > 0, self._bad_calls + 1 if 2 * lost > self._per_call else 0
+        self._bad_calls = self._bad_calls + 1 if 2 * lost > self._per_call else 0
         if not lost:
             self._sound = iteration
-            return
-        sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
-        before = f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before"
         if self._bad_calls >= DIVERGED_AFTER:
+            sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
             raise DexsimError(
                 f"training diverged: in each of the last {DIVERGED_AFTER} calls most gradients were not finite, the "
-                f"first one after iteration {self._sound}; {before}"
+                f"first one after iteration {self._sound}; "
+                + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
             )
-        if not known:
-            text = f"{lost} of {self._per_call} updates skipped, their gradient is not finite"
-            processes.print_on_first(f"iteration {iteration}: {text}; {before}")

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.physics.cuda import launch
-from dexsim.physics.cuda.law import PrintedLaw, print_law
-from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
+from dexsim.physics.cuda.program import PrintedLaw, compile_kernel, find_compiler, print_law, source
 from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
 from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, without_gradient
 from dexsim.physics.law import record

@@ -21,7 +21,7 @@ from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import c_backend
 from dexsim.physics import model as scene_model
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.interface import PhysicsState
+from dexsim.physics.interface import PhysicsState, configured
 from dexsim.physics.physics import Physics
 
 WORLDS = 8
@@ -287,9 +287,13 @@ def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compile
     assert np.abs(plain - force).max() > 0.5, "the rubber makes no difference: the test tests nothing"
 
 
+def configure(physics, object, delta):
+    return configured(physics.scene, physics.fields(object, None, delta))
+
+
 def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
     """C MuJoCo leaves out contacts of geoms whose bounding spheres are apart."""
-    model, given = scenes[THIN].mj_model, jax.jit(lambda: scenes[THIN].configure(grip[0], None, THICK - THIN))()
+    model, given = scenes[THIN].mj_model, jax.jit(lambda: configure(scenes[THIN], grip[0], THICK - THIN))()
     size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
     assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)

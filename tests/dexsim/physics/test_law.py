@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.core.errors import ConfigError
-from dexsim.physics.cuda.law import print_law
+from dexsim.physics.cuda.program import print_law
 from dexsim.physics.law import evaluator, record
 
 WORLDS, JOINTS = 16, 12
