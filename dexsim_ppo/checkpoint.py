@@ -73,13 +73,10 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     leaf that is missing, left over, or of another shape or type."""
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
-    where = f"{checkpoint.path}: does not fit this configuration"
-    for name in expected.keys() ^ checkpoint.leaves.keys():
-        raise CheckpointError(f"{where}: {name} is {'missing' if name in expected else 'not expected'}")
-    for name, leaf in expected.items():
-        got = checkpoint.leaves[name]
-        if got.shape != leaf.shape or got.dtype != leaf.dtype:
-            raise CheckpointError(
-                f"{where}: {name}: expected {leaf.dtype}{list(leaf.shape)}, got {got.dtype}{list(got.shape)}"
-            )
+    kind = lambda leaf: "nothing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"  # noqa: E731
+    for name in expected.keys() | checkpoint.leaves.keys():
+        wanted, got = (kind(leaves.get(name)) for leaves in (expected, checkpoint.leaves))
+        if wanted != got:
+            where = f"{checkpoint.path}: does not fit this configuration"
+            raise CheckpointError(f"{where}: {name}: expected {wanted}, got {got}")
     return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in expected])

@@ -86,17 +86,13 @@ def open_source(arguments: ViewArguments) -> "Source":
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code, 0."""
-    description = "Show a hand live in the browser."
-    return show(cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description))
-
-
-def show(arguments: ViewArguments) -> int:
-    """Serve the page until Ctrl-C; returns 0.
+    """The command: serves the page until Ctrl-C. Returns its exit code, 0.
 
     Raises:
       DexsimError: it needs JAX, which is missing; see `open_source`.
     """
+    description = "Show a hand live in the browser."
+    arguments = cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description)
     recorded = asset_path("episodes") / f"{arguments.what}.npz"
     if recorded.is_file() and not find_spec("jax"):
         arguments = dataclasses.replace(arguments, what=str(recorded))

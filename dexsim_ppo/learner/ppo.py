@@ -21,7 +21,6 @@ from dexsim.core.layout import layout_size
 from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
-from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
 from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
@@ -128,7 +127,7 @@ def train_iteration(
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
-    batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
+    batch = prepare(config, state, rollout, mesh)
     learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
     learner, update_metrics = update(config, normalizers, batch.samples, update_key, learner, mesh)
     metrics |= update_metrics | {
@@ -197,32 +196,22 @@ class TrainingBatch(NamedTuple):
     explained_variance: jax.Array  # [] share of the returns' variance that the critic's values explain
 
 
-def prepare(
-    config: PPOConfig,
-    value_stats: RunningStats,
-    observation_stats: dict[str, RunningStats],
-    params: Params,
-    rollout: Rollout,
-    mesh: Mesh | None = None,
-) -> TrainingBatch:
+def prepare(config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh | None = None) -> TrainingBatch:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
-    flags = rollout.terminated, rollout.truncated
-    advantage, target = compute_gae(
-        rollout.reward, rollout.value, rollout.next_value, *flags, config.discount, config.gae_lambda
-    )
-    observations = {group: rollout.obs[group] for group in observation_stats}
+    advantage, target = compute_gae(config, rollout)
+    observations = {group: rollout.obs[group] for group in state.observation_stats}
     values = {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}
     means, variances = moments(values, mesh)
     size = advantage.size
     observation_stats = {
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
-        for group, stats in observation_stats.items()
+        for group, stats in state.observation_stats.items()
     }
-    old_mean, old_std = value_stats.mean, value_std(value_stats)
-    value_stats = merge_moments(value_stats, means["target"], variances["target"], size)
+    old_mean, old_std = state.value_stats.mean, value_std(state.value_stats)
+    value_stats = merge_moments(state.value_stats, means["target"], variances["target"], size)
     mean, std = value_stats.mean, value_std(value_stats)
-    critic = rescale_output(params.critic, old_mean, old_std, mean, std)
+    critic = rescale_output(state.params.critic, old_mean, old_std, mean, std)
     samples = Samples(
         obs=rollout.obs,
         decision=rollout.decision,
@@ -238,8 +227,29 @@ def prepare(
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
     samples = in_blocks(samples, blocks, sequences=rollout.carry is not None)
     explained = 1 - variances["error"] / variances["target"]
-    params = dataclasses.replace(params, critic=critic)
+    params = dataclasses.replace(state.params, critic=critic)
     return TrainingBatch(samples, params, value_stats, observation_stats, explained)
+
+
+def compute_gae(config: PPOConfig, rollout: Rollout) -> tuple[jax.Array, jax.Array]:
+    """Advantages and value targets [T, B]: generalised advantage estimation (Schulman et al. 2016).
+
+    Either ending cuts the sum over later steps. A terminated step has no value after it; a truncated one
+    bootstraps from the value of its true final observation.
+    """
+    # `where`, not a product: the value of a diverged final state may be NaN.
+    bootstrap = jnp.where(rollout.terminated, 0.0, rollout.next_value)
+    delta = rollout.reward + config.discount * bootstrap - rollout.value
+    ended = (rollout.terminated | rollout.truncated).astype(rollout.reward.dtype)
+    decay = config.discount * config.gae_lambda * (1.0 - ended)
+
+    def backward(advantage, step):
+        delta_t, decay_t = step
+        advantage = delta_t + decay_t * advantage
+        return advantage, advantage
+
+    _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, decay), reverse=True, unroll=8)
+    return advantage, advantage + rollout.value
 
 
 def strong_types(tree: Any) -> Any:

@@ -20,13 +20,12 @@ from dexsim.core.errors import DexsimError
 from dexsim.hand.source import record_of
 from dexsim.registry import task_option
 from dexsim_ppo import checkpoint
-from dexsim_ppo.evaluate import Evaluator, write_video
+from dexsim_ppo.evaluate import Evaluator, headline, print_report, write_video, written
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import headline, print_report, written
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.fine_tune import initialize_from

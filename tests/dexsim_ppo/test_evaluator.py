@@ -10,9 +10,8 @@ import pytest
 from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.evaluate import Evaluator
+from dexsim_ppo.evaluate import Evaluator, mean_interval, summarize
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import mean_interval, summarize
 
 
 class Totals(TinyEnv):

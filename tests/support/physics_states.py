@@ -1,12 +1,15 @@
 """States of a scene for tests of an engine, and what C MuJoCo makes of them in double precision."""
 
 import copy
+import types
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from c_scene import force_on
 
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.contact import pairs_with
 from dexsim.physics.interface import PhysicsScene, places
 
 States = dict[str, np.ndarray]
@@ -23,6 +26,30 @@ FIELDS = (
     "pair_solref",
     "pair_solimp",
 )
+
+
+def scene_of_model(
+    model: mujoco.MjModel, slots: tuple[str, ...], driven: np.ndarray, tips: np.ndarray, tip_geoms: np.ndarray
+) -> PhysicsScene:
+    """The scene of a hand of hinges, of which joints `driven` have motors, and of an object whose body is "object" and
+    whose geoms are "object_0" and on, one for each of the slots."""
+    geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
+    return PhysicsScene(
+        hand=types.SimpleNamespace(num_fingers=len(tips), model_path="hand.xml"),
+        config=PhysicsConfig(),
+        slots=slots,
+        model=model,
+        joint_qpos=driven,
+        joint_dof=driven,
+        object_qpos=np.arange(model.nq - 7, model.nq),
+        object_dof=np.arange(model.nv - 6, model.nv),
+        object_body=model.body("object").id,
+        object_geoms=geoms,
+        object_pairs=pairs_with(model, geoms),
+        tip_bodies=tips,
+        tip_geoms=tip_geoms,
+        tip_growth=np.ones((len(tip_geoms), 3)),
+    )
 
 
 def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:

@@ -2,14 +2,13 @@
 
 import ctypes
 import functools
-import types
 
 import mujoco
 import numpy as np
 import pytest
 import warp_emulation
+from physics_states import scene_of_model
 
-from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.scene import MAX_CONTACTS, Buffer, declare_args, find_links, kernel_constants
 from dexsim.physics.interface import PhysicsScene
 
@@ -63,23 +62,8 @@ def scene_of(slots: tuple[str, ...]) -> PhysicsScene:
         spec.add_pair(geomname1=one, geomname2=two, condim=3)
     model = spec.compile()
     model.geom_rbound[model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE] = 1.0  # their sizes differ between worlds
-    hinges, sized = model.nv - 6, ("tip", "block")
-    return PhysicsScene(
-        hand=types.SimpleNamespace(model_path="hand.xml", num_fingers=1),
-        config=PhysicsConfig(),
-        slots=slots,
-        model=model,
-        joint_qpos=np.arange(hinges),
-        joint_dof=np.arange(hinges),
-        object_qpos=np.arange(hinges, hinges + 7),
-        object_dof=np.arange(hinges, hinges + 6),
-        object_body=model.body("object").id,
-        object_geoms=np.array([model.geom(f"object_{k}").id for k in range(len(slots))]),
-        object_pairs=np.arange(model.npair - len(WITHIN)),
-        tip_bodies=np.array([model.body("tip").id]),
-        tip_geoms=np.array([model.geom(name).id for name in sized]),
-        tip_growth=np.ones((len(sized), 3)),
-    )
+    sized = np.array([model.geom(name).id for name in ("tip", "block")])
+    return scene_of_model(model, slots, np.arange(model.nv - 6), np.array([model.body("tip").id]), sized)
 
 
 def geom_type(kind: str) -> int:

@@ -1,8 +1,6 @@
-"""The live view: what it draws, what its controls change, and the page in a real browser."""
+"""The live view: what it draws, what its controls change, and the page's buttons."""
 
 import dataclasses
-import io
-import shutil
 import subprocess
 import sys
 import threading
@@ -243,56 +241,33 @@ def test_poses_for_pictures_are_those_of_the_kinematics(hand):
 # --- the page -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def page(simulation):
-    """The page in a headless Chromium, its viewer running beside it."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no Chromium on this machine (apt-get install chromium)")
-    pytest.importorskip("viser")
-    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
-    from dexsim.view.viewer import Viewer
-
-    viewer, stop = Viewer(simulation, title="test", port=18080), threading.Event()
-    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
-    running.start()
-    with sync_playwright() as playwright:
-        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=chromium, args=software)
-        opened = browser.new_page(viewport={"width": 900, "height": 600})
-        opened.goto(viewer.url)
-        opened.wait_for_selector("canvas")
-        opened.viewer = viewer
-        yield opened
-        browser.close()
-    stop.set()
-    running.join(10)
-    assert not running.is_alive()
-
-
 def wait_until(condition, seconds=25.0):
     end = time.monotonic() + seconds
     while not (met := condition()) and time.monotonic() < end:
-        time.sleep(0.2)
+        time.sleep(0.02)
     return met
 
 
-@pytest.mark.slow
-def test_the_page_shows_the_hand_and_its_buttons_work(page):
-    from PIL import Image
+def test_the_page_runs_pauses_steps_and_begins_anew():
+    pytest.importorskip("viser")
+    from dexsim.view.viewer import Viewer
 
-    def colors():
-        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[100:, :450]
-        return len(np.unique(picture.reshape(-1, 3), axis=0))
-
-    length = lambda: float(page.viewer.source._state.length)  # noqa: E731
-    assert wait_until(lambda: colors() > 200), "the canvas stays empty"
-    page.viewer.paused.value = True
-    time.sleep(0.5)
-    at = length()
-    time.sleep(0.5)
-    assert length() == at
-    page.get_by_role("button", name="step").click()
-    assert wait_until(lambda: length() == at + 1)
-    page.get_by_role("button", name="reset").click()
-    assert wait_until(lambda: length() == 0)
+    source = open_source(ViewArguments(what=str(asset_path("episodes") / "grasp.npz")))
+    viewer, stop, tick = Viewer(source, title="test", port=18080), threading.Event(), lambda: source._tick
+    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
+    running.start()
+    try:
+        assert wait_until(lambda: tick() > 5), "in real time"
+        viewer.paused.value = True
+        time.sleep(0.2)
+        at = tick()
+        time.sleep(0.2)
+        assert tick() == at
+        viewer._step.value = True
+        assert wait_until(lambda: tick() == at + 1)
+        viewer._reset.value = True
+        assert wait_until(lambda: tick() == 0)
+    finally:
+        stop.set()
+        running.join(10)
+    assert not running.is_alive()

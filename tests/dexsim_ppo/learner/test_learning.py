@@ -115,7 +115,7 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
     @jax.jit
     def collect(state):
         _, rollout, metrics = ppo.collect_rollout(env, config, state)
-        batch = ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
+        batch = ppo.prepare(config, state, rollout)
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         return rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
 
