@@ -1,5 +1,6 @@
 """What a view shows: frames from a source, which also says what of it can be changed."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from dexsim.hand.description import Hand
@@ -31,13 +32,15 @@ class Source(Protocol):
         """Put what can be changed on the page, before anything else is asked for: `gui` is viser's."""
         ...
 
-    def reset(self) -> Frame:
-        """Begin anew."""
+    def episode(self) -> Iterator[Frame]:
+        """The frames of a new episode, to its end."""
         ...
 
-    def step(self) -> Frame:
-        """The next frame; begins anew by itself after an end."""
-        ...
+
+def frames_of(source: Source) -> Iterator[Frame]:
+    """Of one episode after another."""
+    while True:
+        yield from source.episode()
 
 
 def clicked(button: Any) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from dexsim.core.errors import DexsimError
 from dexsim.render.panel import FELT, draw_panel, read_outs
 from dexsim.view.scene import Scene
-from dexsim.view.source import Frame, Source, clicked
+from dexsim.view.source import Frame, Source, clicked, frames_of
 
 _PANEL = (300, 560)  # pixels of the taxel maps
 _READ_OUT = 0.2  # s between two updates of text and maps: they cost more than the scene
@@ -58,12 +58,13 @@ class Viewer:
     def run(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Show the source in real time until `stopped`; returns with the server down."""
         try:
-            frame, due = self.source.reset(), time.monotonic()
+            frames, due = frames_of(self.source), time.monotonic()
+            frame = next(frames)
             while not stopped():
-                if clicked(self._reset):
-                    frame = self.source.reset()
-                elif not self.paused.value or clicked(self._step):
-                    frame = self.source.step()
+                if reset := clicked(self._reset):
+                    frames = frames_of(self.source)
+                if reset or not self.paused.value or clicked(self._step):
+                    frame = next(frames)
                 self._show(frame)
                 due = max(due + self.source.period, time.monotonic() - self.source.period)
                 time.sleep(max(due - time.monotonic(), 0.001))

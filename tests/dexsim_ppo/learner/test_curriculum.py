@@ -6,60 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_env import SMALL, TinyEnv
+from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.config import CurriculumConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
 
 RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
 
-@pytree_dataclass
-class WidthState:
-    """`TinyState` and the width of the next episode's start positions."""
-
-    inner: object
-    scale: jax.Array
-    drawn: jax.Array  # the width that this episode was drawn at
-
-    def __getattr__(self, name):
-        return getattr(object.__getattribute__(self, "inner"), name)
-
-
-class WideEnv(TinyEnv):
-    """Starts spread by `scale`; every episode ends after `lives` steps, by failure or by the time limit."""
-
-    def __init__(self, lives=4, fails=False):
-        super().__init__()
-        self.lives, self.fails = lives, fails
-
-    def reset(self, key, scale=None):
-        assert scale is not None, "a reset without the curriculum's scale"
-        scale, inner = jnp.asarray(scale, jnp.float32), self._start(key)
-        return WidthState(dataclasses.replace(inner, metrics=inner.metrics | {"drawn": scale}), scale, scale)
+class Together(TinyEnv):
+    """All episodes begin and end together."""
 
     def randomize_episode_time(self, state, key):
         return state
-
-    def step(self, state, action):
-        inner = super().step(state.inner, action)
-        done = inner.metrics["length"] >= self.lives
-        inner = dataclasses.replace(
-            inner,
-            terminated=done & self.fails,
-            truncated=done & (not self.fails),
-            metrics=inner.metrics | {"drawn": state.drawn},
-        )
-        return dataclasses.replace(state, inner=inner)
-
-    def restart(self, state, done):
-        fresh = self.reset(state.inner.key, state.scale)
-        return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, state)
-
-    def set_randomization_scale(self, state, scale):
-        return dataclasses.replace(state, scale=scale)
 
 
 def run(env, rules, iterations):
@@ -73,7 +33,7 @@ def run(env, rules, iterations):
 
 
 def test_ranges_widen_with_success_and_episodes_update_scale():
-    state, rows = run(WideEnv(), RULES, 7)
+    state, rows = run(Together(TinyConfig(horizon=4)), RULES, 7)
     np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
     assert all(row["curriculum/success"] == 1 for row in rows)
     np.testing.assert_allclose(state.scale, 1.0)
