@@ -119,14 +119,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     given = {argument.split("=")[0] for argument in argv}
     if not given & {"--task", "--resume", "--policy", "--config", "-h", "--help"}:
-        print(
-            f"give a task: {', '.join(catalog()['tasks'])}\n"
-            "for example: python -m dexsim_ppo.train --task grasp\n"
-            "or a run to continue (--resume), a policy to fine-tune (--policy), a run whose options to use (--config); "
-            "--help lists all options",
-            file=sys.stderr,
+        raise ConfigError(
+            f"give a task (--task, one of {', '.join(catalog()['tasks'])}), a run to continue (--resume), a policy to "
+            "fine-tune (--policy), or a run whose options to use (--config); --help lists all options"
         )
-        return 2
     cli.enable_caches()
     if "--devices" in given:
         processes.connect()

@@ -40,7 +40,6 @@ from dexsim.physics.interface import (
     PhysicsState,
     StepResult,
     places,
-    without_gradient,
 )
 from dexsim.physics.law import evaluator, record
 
@@ -68,24 +67,19 @@ class CBackend:
         _engines[self._key] = self._engine
         _newest.append(self._engine)
         ffi.register(TARGET, "cpu", _serve)
-        self._tick = without_gradient("c", self._call, 1)
 
     def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick in one call."""
+        # Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the whole
+        # batch shares.
         recorded = record(law, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
-        given = [fields[name] for name in self._fields]
-        arguments = [*given, state.qpos, state.qvel, state.warmstart, push, *recorded.constants]
-        *after, force = self._tick(recorded.text, *map(jnp.asarray, arguments))
+        moving = [state.qpos, state.qvel, state.warmstart]
+        arguments = [*(fields[name] for name in self._fields), *moving, push, *recorded.constants]
+        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in moving]
+        results.append(jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state.qpos.dtype))
+        call = jax.ffi.ffi_call(TARGET, results, vmap_method="expand_dims")
+        *after, force = call(*map(jnp.asarray, arguments), engine=self._key, law=recorded.text)
         return StepResult(PhysicsState(*after), force)
-
-    def _call(self, law: str, *arguments: jax.Array) -> list[jax.Array]:
-        """Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the
-        whole batch shares."""
-        count = len(self._fields)
-        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[count : count + 3]]
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
-        call = jax.ffi.ffi_call(TARGET, [*state, force], vmap_method="expand_dims")
-        return list(call(*arguments, engine=self._key, law=law))
 
 
 class _Worlds:
@@ -115,7 +109,7 @@ class HostEngine:
         self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
 
     def tick(self, law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
-        """A control tick of a batch; see `CBackend._call` for what crosses.
+        """A control tick of a batch; see `CBackend.advance` for what crosses.
 
         Raises:
           RuntimeError: in a forked child, which has none of its parent's threads.
@@ -164,7 +158,7 @@ _newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
 
 
 def _serve(frame: Any) -> None:
-    """A call of XLA's (`CBackend._call`)."""
+    """A call of XLA's (`CBackend.advance`)."""
     attributes = ffi.attributes(frame)
     engine = _engines.get(attributes["engine"].decode())
     if engine is None:

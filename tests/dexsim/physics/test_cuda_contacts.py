@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 import warp_emulation
 from physics_states import scene_of_model
+from scipy.spatial.transform import Rotation
 
-from dexsim.physics.cuda.scene import MAX_CONTACTS, Buffer, declare_args, find_links, kernel_constants
+from dexsim.physics.cuda.scene import (
+    MAX_CONTACTS,
+    Buffer,
+    declare_args,
+    find_links,
+    kernel_constants,
+    rotation_matrix,
+)
 from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -76,7 +84,7 @@ def in_links(slots: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray
     the object's last."""
     model, links = scene_of(slots).model, find_links(scene_of(slots))
     body, hinges = model.geom_bodyid, links.hinges
-    turn = links.rotation[body] @ np.array([matrix(quat) for quat in model.geom_quat])
+    turn = links.rotation[body] @ np.array([rotation_matrix(quat) for quat in model.geom_quat])
     place = links.place[body] + np.einsum("gij,gj->gi", links.rotation[body], model.geom_pos)
     return np.choose(links.link[body] + 1, [hinges, *range(hinges), hinges + 1]), turn, place
 
@@ -120,7 +128,7 @@ class World:
         self.size = rounded(np.array([*(draw_size(kind, random) for kind in scene.slots), *tips]))
         self.quat = random.normal(size=(slots, 4))
         self.quat /= np.linalg.norm(self.quat, axis=1, keepdims=True)
-        self.turn = np.array([matrix(quat) for quat in self.quat])
+        self.turn = np.array([rotation_matrix(quat) for quat in self.quat])
         self.place = np.array([[40.0 * (k + 1), 0, 0] for k in range(slots)])
         self.place[scene.object_geoms == second] = random.normal(size=3) * 0.01
         self.place = rounded(self.place)
@@ -168,8 +176,8 @@ class World:
         if random.uniform() < 0.5:  # almost flat on it, or parallel to it
             # On the rim of a cylinder the place of a contact is no more exact than the tilt.
             least = -3 if model.geom_type[second] == mujoco.mjtGeom.mjGEOM_CYLINDER else -5
-            tilt = turned(random.normal(size=3) * 10.0 ** random.uniform(least, -1))
-            spin = turned([0, 0, random.uniform(0, 2 * np.pi)]) if random.uniform() < 0.7 else np.eye(3)
+            tilt = Rotation.from_rotvec(random.normal(size=3) * 10.0 ** random.uniform(least, -1)).as_matrix()
+            spin = Rotation.from_rotvec([0, 0, random.choice([0, 1, 1]) * random.uniform(0, 2 * np.pi)]).as_matrix()
             turn = tilt @ axes @ spin @ data.geom_xmat[second].reshape(3, 3).T
         way = random.normal(size=3)
         if random.uniform() < 0.5:
@@ -200,22 +208,7 @@ def draw_size(kind: str, random: np.random.Generator) -> np.ndarray:
 
 
 def draw_rotation(random: np.random.Generator) -> np.ndarray:
-    quat = random.normal(size=4)
-    return matrix(quat / np.linalg.norm(quat))
-
-
-def turned(vector) -> np.ndarray:
-    """The rotation by a vector in rad."""
-    quat = np.zeros(4)
-    angle = np.linalg.norm(vector)
-    mujoco.mju_axisAngle2Quat(quat, np.asarray(vector, float) / max(angle, 1e-12), angle)
-    return matrix(quat)
-
-
-def matrix(quat: np.ndarray) -> np.ndarray:
-    elements = np.zeros(9)
-    mujoco.mju_quat2Mat(elements, quat)
-    return elements.reshape(3, 3)
+    return Rotation.from_quat(random.normal(size=4)).as_matrix()
 
 
 def pose(rotation: np.ndarray, place) -> np.ndarray:
