@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dexsim.physics.cuda.scene import (
     MAX_CONTACTS,
     Buffer,
+    args_type,
     declare_args,
     find_links,
     kernel_constants,
@@ -100,16 +101,14 @@ def finder(slots: tuple[str, ...]):
     ]
     text = "\n".join([declare_args(buffers), kernel_constants(scene)])
     library = ctypes.CDLL(str(warp_emulation.build(text, "contacts.cpp")))
-    fields = [*((buffer.name, ctypes.c_void_p) for buffer in buffers), ("n", ctypes.c_int)]
-    arguments = type("Args", (ctypes.Structure,), {"_fields_": [*fields, ("settings", ctypes.c_byte * 64)]})
 
     def find(worlds):
         """Contacts [N, MAX_CONTACTS] of worlds and their numbers [N]."""
         names = ("size", "place", "quat", "links", "object")
         arrays = [np.array([getattr(world, name) for world in worlds], np.float32) for name in names]
-        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
         contacts, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
-        args = arguments(*pointers[:3], len(worlds))
+        args = args_type(3)((ctypes.c_void_p * 3)(*pointers[:3]), len(worlds))
         outputs = (part.ctypes.data_as(ctypes.c_void_p) for part in (contacts, count))
         library.find(ctypes.byref(args), *pointers[3:], *outputs)
         return contacts, count
