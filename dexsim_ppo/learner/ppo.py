@@ -41,13 +41,18 @@ class Training(NamedTuple):
 
 
 def make_train(
-    env: Any, config: PPOConfig, curriculum: CurriculumConfig | None = None, mesh: Mesh | None = None
+    env: Any,
+    config: PPOConfig,
+    curriculum: CurriculumConfig | None = None,
+    mesh: Mesh | None = None,
+    start: Callable[[TrainState], TrainState] | None = None,
 ) -> Training:
     """Compiled `init` and `step`.
 
     Args:
       env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
       mesh: devices to spread the environments over (`learner.sharding`); None for one.
+      start: from a fresh learner's state to that which training starts from; None for the same.
     """
     check_float32()
     env = adapt(env)
@@ -55,7 +60,8 @@ def make_train(
         curriculum = None
 
     def init(key: jax.Array) -> TrainState:
-        return strong_types(init_state(env, config, key, curriculum, mesh))
+        state = init_state(env, config, key, curriculum, mesh)
+        return strong_types(start(state) if start else state)
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
         iterate = lambda s, _: train_iteration(env, config, s, curriculum, mesh)  # noqa: E731

@@ -131,7 +131,7 @@ def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], key: jax.Array) -
 
 
 def place(tree: Tree, like: Any) -> Tree:
-    """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`."""
+    """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`, where these are."""
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
     keys = jax.tree.map(is_key, tree)
     plain = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if is_key(x) else x), tree)

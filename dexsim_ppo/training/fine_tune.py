@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
@@ -54,12 +53,12 @@ def check_network(policy: Policy, config: PPOConfig) -> None:
 def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
     """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
     normalisation that it was trained with."""
-    stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
-    learnt = policy.params.layers, policy.params.memory
-    (actor, memory), average = (jax.tree.map(jnp.copy, learnt) for _ in range(2))  # a step donates both
+    with jax.ensure_compile_time_eval():
+        stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    actor, memory = policy.params.layers, policy.params.memory
     return dataclasses.replace(
         state,
         params=dataclasses.replace(state.params, actor=actor, memory=memory),
-        average=average,
+        average=(actor, memory),
         observation_stats=state.observation_stats | {"actor": stats},
     )

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 from jax.sharding import Mesh
 
 import dexsim
@@ -89,36 +88,23 @@ class Run:
 
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
-        training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh)
+        start = functools.partial(initialize_from, source, self.config) if isinstance(source, Policy) else None
+        training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh, start)
         key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
-        if isinstance(source, checkpoint.Checkpoint):
-            state = self._resume(source, shapes)
+        resumed = self._resume(source, shapes) if isinstance(source, checkpoint.Checkpoint) else None
+        with ThreadPoolExecutor(1) as aside:  # One core compiles and runs `init` while another traces the step.
+            fresh = aside.submit(lambda: resumed or jax.block_until_ready(training.init(key)))
             step = cast(Any, training.step).lower(shapes).compile()
-        else:
-            with ThreadPoolExecutor(1) as aside:  # One core compiles and runs `init` while another traces the step.
-                fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
-                step = cast(Any, training.step).lower(shapes).compile()
-                state = self._initialize(fresh.result(), source)
         self.clock["compile_s"] = time.perf_counter() - begin
-        return state, step
+        return fresh.result(), step
 
     def _resume(self, source: checkpoint.Checkpoint, shapes: TrainState) -> TrainState:
         state, progress = checkpoint.restore(source, shapes), source.content["progress"]
         if self.folder.has_best(int(state.iteration)):
             self.best = progress["best"]
         self.seconds_before, self.without_better = progress["seconds"], progress["without_better"]
-        return place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
-
-    def _initialize(self, state: TrainState, source: Policy | None) -> TrainState:
-        """The fresh state with what the policy to fine-tune has learnt."""
-        if source:
-            fresh, state = state, initialize_from(source, self.config, state)
-            if self.mesh is not None:
-                learned = lambda s: (s.params, s.average, s.observation_stats)  # noqa: E731
-                params, average, stats = place(learned(state), learned(fresh))
-                state = dataclasses.replace(state, params=params, average=average, observation_stats=stats)
-        return state
+        return place(state, shapes)
 
     def _loop(self, state: TrainState, step: Callable, log: MetricsLog | None, stopped: Callable[[], int]) -> None:
         arguments, per_call = self.arguments, self.config.iterations_per_call

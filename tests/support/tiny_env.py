@@ -146,4 +146,4 @@ make_train, make_evaluator = functools.cache(trainer.make_train), functools.cach
 
 def training_of(config: PPOConfig = SMALL, env_class: type[TinyEnv] = TinyEnv) -> Training:
     """The learner on the environment, compiled once for all tests of a process."""
-    return make_train(make_env(env_class, TinyConfig()), config, CurriculumConfig(), None)
+    return make_train(make_env(env_class, TinyConfig()), config, CurriculumConfig(), None, None)
