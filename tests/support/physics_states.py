@@ -15,18 +15,6 @@ from dexsim.physics.interface import PhysicsScene, places
 States = dict[str, np.ndarray]
 """By name, float32 [N, size]: qpos, qvel, warmstart, push, targets of the joints, and the fields of the object."""
 
-FIELDS = (
-    "geom_size",
-    "geom_pos",
-    "geom_quat",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "pair_friction",
-    "pair_solref",
-    "pair_solimp",
-)
-
 
 def scene_of_model(
     model: mujoco.MjModel, slots: tuple[str, ...], driven: np.ndarray, tips: np.ndarray, tip_geoms: np.ndarray
@@ -60,18 +48,16 @@ def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) ->
 
 def read_fields(scene: PhysicsScene, model: mujoco.MjModel) -> States:
     """What one world has in place of the scene's constants; one friction for both directions."""
-    where = places(scene)
-    fields = {name: np.array(getattr(model, name)[where[name]]) for name in FIELDS}
+    fields = {name: np.array(getattr(model, name)[where]) for name, where in places(scene).items()}
     return fields | {"pair_friction": fields["pair_friction"][:, 0]}
 
 
 def write_fields(scene: PhysicsScene, model: mujoco.MjModel, states: States, row: int) -> None:
-    """The opposite of `read_fields`."""
-    where = places(scene)
-    for name in FIELDS:
-        here = getattr(model, name)[where[name]]
-        value = states[name][row].astype(float)
-        getattr(model, name)[where[name]] = value[:, None] if name == "pair_friction" else value.reshape(here.shape)
+    """The opposite of `read_fields`, but for the bounds of the broad phase."""
+    for name, where in places(scene).items():
+        if name != "geom_rbound":
+            here, value = getattr(model, name)[where], states[name][row].astype(float)
+            getattr(model, name)[where] = value[:, None] if name == "pair_friction" else value.reshape(here.shape)
     model.body_subtreemass[scene.object_body] = model.body_mass[scene.object_body]
 
 
