@@ -43,7 +43,7 @@ class Training(NamedTuple):
 def make_train(
     env: Any,
     config: PPOConfig,
-    curriculum: CurriculumConfig | None = None,
+    curriculum: CurriculumConfig = CurriculumConfig(),  # noqa: B008
     mesh: Mesh | None = None,
     start: Callable[[TrainState], TrainState] | None = None,
 ) -> Training:
@@ -56,8 +56,6 @@ def make_train(
     """
     check_float32()
     env = adapt(env)
-    if curriculum is not None and not curriculum.on:
-        curriculum = None
 
     def init(key: jax.Array) -> TrainState:
         state = init_state(env, config, key, curriculum, mesh)
@@ -90,7 +88,7 @@ def make_train(
 
 
 def init_state(
-    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig | None, mesh: Mesh | None
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig, mesh: Mesh | None
 ) -> TrainState:
     """A fresh learner, and freshly reset environments [B, ...] with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
@@ -102,7 +100,7 @@ def init_state(
     critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
     params = init_params(params_key, actor, critic, config.initial_std, memory)
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
-    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    scale = jnp.float32(curriculum.start) if curriculum.on else None
     reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
@@ -121,11 +119,7 @@ def init_state(
 
 
 def train_iteration(
-    env: Environment,
-    config: PPOConfig,
-    state: TrainState,
-    curriculum: CurriculumConfig | None = None,
-    mesh: Mesh | None = None,
+    env: Environment, config: PPOConfig, state: TrainState, curriculum: CurriculumConfig, mesh: Mesh | None
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
     key, _, update_key = jax.random.split(state.key, 3)
@@ -144,7 +138,7 @@ def train_iteration(
         "skipped_updates": learner.skipped_updates,
     }
     scale = state.scale
-    if curriculum is not None and scale is not None:
+    if scale is not None:
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
         env_state = jax.vmap(cast(Any, env).set_randomization_scale, (0, None))(env_state, scale)
