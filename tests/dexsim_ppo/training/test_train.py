@@ -214,8 +214,8 @@ GOOD_ITERATIONS = 3
 class Breaks(TinyEnv):
     """From its 24th step on, the actors of environments that started on the right side observe NaN."""
 
-    def _start(self, key):
-        state = super()._start(key)
+    def _start(self, key, *scale):
+        state = super()._start(key, *scale)
         return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
 
     def randomize_episode_time(self, state, key):
