@@ -43,12 +43,13 @@ from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import (
     TrainArguments,
     arguments_from_dict,
+    check_network,
     check_resumed,
     find_hand,
+    fine_tuning_config,
     printable,
     training_config,
 )
-from dexsim_ppo.training.fine_tune import check_network, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder
 from dexsim_ppo.training.trainer import Run

@@ -20,7 +20,7 @@ from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.install import require
 
 if TYPE_CHECKING:
-    from dexsim.view.source import Source
+    from dexsim.view.viewer import Source
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Frame
+from dexsim.view.scene import Frame
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError

@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import Episodes
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Frame
+from dexsim.view.scene import Frame
 
 
 class Recording:

@@ -18,7 +18,8 @@ from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
-from dexsim.view.source import Frame, clicked
+from dexsim.view.scene import Frame
+from dexsim.view.viewer import clicked
 from dexsim_ppo.policy import Policy, load_policy
 
 NONE = "none"

@@ -18,7 +18,6 @@ from jax.sharding import Mesh
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
 from dexsim.core.layout import layout_size
-from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
@@ -27,7 +26,7 @@ from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments, value_std
 from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
 from dexsim_ppo.learner.types import Environment, TrainState
-from dexsim_ppo.learner.update import Learner, update
+from dexsim_ppo.learner.update import Learner, init_adam, update
 
 
 class Training(NamedTuple):
@@ -105,7 +104,7 @@ def init_state(
     return TrainState(
         params=params,
         average=(params.actor, params.memory),
-        adam=adam.init(params),
+        adam=init_adam(params),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()),

@@ -7,7 +7,6 @@ import jax
 
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.networks import GRU, MLP, Params
 from dexsim_ppo.learner.running_stats import RunningStats
 
@@ -60,6 +59,15 @@ class Environment(Protocol):
 
     def randomize_episode_time(self, state: Any, key: jax.Array) -> Any:
         """Set the episode clock to a random time, so that a batch does not truncate all at once."""
+
+
+@pytree_dataclass
+class AdamState:
+    """Running moments of the gradient, shaped like the parameters (Adam, Kingma and Ba 2015)."""
+
+    count: jax.Array  # int32 []
+    mean: Params
+    variance: Params
 
 
 @pytree_dataclass

@@ -22,12 +22,12 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, headline, print_report, write_video, written
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.learner.running_stats import recover_stats
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
-from dexsim_ppo.training.fine_tune import initialize_from
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, means, policy_of, progress_line, read_metrics
 
 # Selecting the best policy uses starts and episodes that no report has: `evaluate --seed` ends below.
@@ -304,3 +304,17 @@ class Faults:
                 f"first one after iteration {self._sound}; "
                 + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
             )
+
+
+def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+    """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
+    normalisation that it was trained with."""
+    with jax.ensure_compile_time_eval():
+        stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    actor, memory = policy.params.layers, policy.params.memory
+    return dataclasses.replace(
+        state,
+        params=dataclasses.replace(state.params, actor=actor, memory=memory),
+        average=(actor, memory),
+        observation_stats=state.observation_stats | {"actor": stats},
+    )

@@ -18,7 +18,7 @@ from dexsim.objects.config import KINDS
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim.view.scene import force_arrows
 from dexsim.view.simulation import NONE, Simulation, find_policies
-from dexsim.view.source import frames_of
+from dexsim.view.viewer import Viewer, frames_of
 from dexsim_ppo import load_policy
 
 
@@ -188,11 +188,11 @@ def test_the_demo_shows_recorded_episodes_without_jax():
     recorded = sorted(path.stem for path in asset_path("episodes").glob("*.npz"))
     said = python_without_jax(f"""
 import itertools
-from dexsim.view import __main__ as demo, source, viewer
+from dexsim.view import __main__ as demo, viewer
 class Page(viewer.Viewer):
     def run(self):
         ticks = sum(len(episode.seconds) for episode in self.source._episodes)
-        frames = list(itertools.islice(source.frames_of(self.source), ticks))
+        frames = list(itertools.islice(viewer.frames_of(self.source), ticks))
         for frame in frames[::100]:
             self._read_out_at = 0.0
             self._show(frame)
@@ -252,8 +252,6 @@ def wait_until(condition, seconds=25.0):
 
 def test_the_page_runs_pauses_steps_and_begins_anew():
     pytest.importorskip("viser")
-    from dexsim.view.viewer import Viewer
-
     source = open_source(ViewArguments(what=str(asset_path("episodes") / "grasp.npz")))
     viewer, stop, shown = Viewer(source, title="test", port=18080), threading.Event(), []
     viewer.scene.show = lambda frame, _: shown.append(round(float(frame.snapshot.seconds) / source.period))

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim_ppo.learner import adam, running_stats
+from dexsim_ppo.learner import running_stats
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments
-from dexsim_ppo.learner.update import adapt_learning_rate
+from dexsim_ppo.learner.update import adapt_learning_rate, init_adam, step_adam
 
 
 def merged(stats, batch):
@@ -39,10 +39,10 @@ class TestAdam:
         params = {"a": rng.normal(size=3), "b": rng.normal(size=(2, 2))}
         grads = [{k: rng.normal(size=v.shape) for k, v in params.items()} for _ in range(5)]
         single = lambda tree: jax.tree.map(jnp.float32, tree)  # noqa: E731
-        state, got = adam.init(single(params)), single(params)
+        state, got = init_adam(single(params)), single(params)
         moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
         for t, grad in enumerate(grads, start=1):
-            got, state = adam.update(single(grad), state, got, 0.01)
+            got, state = step_adam(single(grad), state, got, 0.01)
             for k, g in grad.items():
                 m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
                 moments[k] = m, v

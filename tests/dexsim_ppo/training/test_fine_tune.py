@@ -15,8 +15,9 @@ from dexsim_ppo import train
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
+from dexsim_ppo.training.arguments import fine_tuning_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
+from dexsim_ppo.training.trainer import initialize_from
 
 
 @pytest.fixture(scope="module")
