@@ -251,7 +251,8 @@ def _from_file(file: checkpoint.Checkpoint) -> Policy:
 
 def _names(layers: int, memory: bool, clip: float) -> PolicyParams:
     """The names of a file's arrays in place of the arrays."""
-    layer: Any = lambda kind, index="": Layer(f"{kind}kernel{index}", f"{kind}bias{index}")  # noqa: E731
+    named: Any = Layer
+    layer = lambda kind, index="": named(f"{kind}kernel{index}", f"{kind}bias{index}")  # noqa: E731
     unit = GRU(layer("input_"), layer("recurrent_")) if memory else None
     normalizer = Normalizer(cast(Any, "mean"), cast(Any, "std"), clip)
     return PolicyParams(tuple(layer("", f"_{i}") for i in range(layers)), normalizer, unit)
