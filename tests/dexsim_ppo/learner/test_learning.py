@@ -43,8 +43,8 @@ def test_the_average_is_over_about_the_last_tenth():
 
 
 class BadRewards(TinyEnv):
-    """Diverges: its reward and final observation are not finite, and it says so by terminating. As with `dexsim.Env`
-    keys advance at every restart, also where nothing is done."""
+    """Diverges on one side: its reward and final observation are not finite, and it says so by terminating. As with
+    `dexsim.Env` keys advance at every restart, also where nothing is done."""
 
     def restart(self, state, done):
         key, fresh_key = jax.random.split(state.key)
@@ -52,7 +52,7 @@ class BadRewards(TinyEnv):
 
     def step(self, state, action):
         state = super().step(state, action)
-        diverged = state.metrics["length"] % 5 == 0
+        diverged = (state.metrics["length"] % 5 == 0) & (state.target > 0)
         poison = lambda x: jnp.where(diverged, jnp.nan, x)  # noqa: E731
         metrics = state.metrics | {"error": poison(state.metrics["error"])}
         return dataclasses.replace(
@@ -75,12 +75,12 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
 
     @jax.jit
     def collect(state):
-        _, rollout, metrics = ppo.collect_rollout(env, config, state)
+        (after, _), rollout, metrics = ppo.collect_rollout(env, config, state)
         batch = ppo.prepare(config, state, rollout)
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-        return rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
+        return after.key, rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
 
-    rollout, metrics, learnt_from, value = collect(state)
+    keys, rollout, metrics, learnt_from, value = collect(state)
     step, restart, seen, now = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart)), [], begin
     for tick, action in enumerate(rollout.decision.action):
         if tick % 16 == 0:  # New episodes are drawn: whoever ends goes on from the last one drawn for it.
@@ -90,6 +90,7 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
         over = now.terminated | now.truncated
         seen.append((now.reward, now.metrics["error"], now.metrics["length"], over))
         now = jax.vmap(choose)(over, fresh, now)
+    np.testing.assert_array_equal(jax.random.key_data(keys), jax.random.key_data(now.key))
     reward, error, length, over = (np.array(column) for column in zip(*seen, strict=True))
     broken = ~np.isfinite(reward)
     reward, error = (np.where(np.isfinite(x), x, 0.0) for x in (reward, error))
