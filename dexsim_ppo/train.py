@@ -102,11 +102,8 @@ def train_policy(
     if not (task or source):
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
-    given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)}
+    given = {"env": config, "ppo": ppo, "policy": str(policy) or None} | options
     default = _with_budget(default, {name for name, value in options.items() if value is not None})
-    if options.get("run_dir"):
-        options["run_dir"] = Path(options["run_dir"])
-    given |= options
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
     run = make_run(arguments, source, started, "train_policy(...)")
     if train_run(run, source, "train_policy(...)"):
