@@ -41,7 +41,7 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
-from dexsim.physics.interface import PhysicsState, StepResult
+from dexsim.physics.interface import PhysicsState, StepResult, configured
 from dexsim.physics.model import build_scene
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
 from dexsim.registry import TASKS
@@ -170,7 +170,7 @@ class Motions:
         # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
         model.geom_sameframe[scene.object_geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         model.body_sameframe[scene.object_body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        for name, values in self.exact.configure(begin.object).items():
+        for name, values in configured(scene, self.exact.fields(begin.object)).items():
             getattr(model, name)[:] = values
         model.body_subtreemass[scene.object_body] = begin.object.mass
         return model

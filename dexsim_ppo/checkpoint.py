@@ -22,8 +22,6 @@ class Checkpoint:
     """A sound file's content."""
 
     path: Path
-    kind: str
-    """`"train"` (a whole `TrainState`) or `"policy"`."""
     task: str
     content: dict[str, Any]
     """Plain data: configurations, observation layout and the like."""
@@ -32,7 +30,8 @@ class Checkpoint:
 
 
 def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], tree: Any) -> None:
-    """Write a pytree of arrays and what describes it, whole or not at all."""
+    """Write a pytree of arrays and what describes it, whole or not at all; `kind` is `"policy"` or, for a whole
+    `TrainState`, `"train"`."""
     leaves, parts = [], []
     for tree_path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         prng = ""
@@ -66,7 +65,7 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
     for leaf in header["leaves"]:
         if leaf["prng"]:
             leaves[leaf["path"]] = jax.random.wrap_key_data(jnp.asarray(leaves[leaf["path"]]), impl=leaf["prng"])
-    return Checkpoint(Path(path), header["kind"], header["task"], header["content"], leaves)
+    return Checkpoint(Path(path), header["task"], header["content"], leaves)
 
 
 def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
@@ -74,13 +73,10 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     leaf that is missing, left over, or of another shape or type."""
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
-    where = f"{checkpoint.path}: does not fit this configuration"
-    for name in expected.keys() ^ checkpoint.leaves.keys():
-        raise CheckpointError(f"{where}: {name} is {'missing' if name in expected else 'not expected'}")
-    for name, leaf in expected.items():
-        got = checkpoint.leaves[name]
-        if got.shape != leaf.shape or got.dtype != leaf.dtype:
-            raise CheckpointError(
-                f"{where}: {name}: expected {leaf.dtype}{list(leaf.shape)}, got {got.dtype}{list(got.shape)}"
-            )
+    kind = lambda leaf: "nothing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"  # noqa: E731
+    for name in expected.keys() | checkpoint.leaves.keys():
+        wanted, got = (kind(leaves.get(name)) for leaves in (expected, checkpoint.leaves))
+        if wanted != got:
+            where = f"{checkpoint.path}: does not fit this configuration"
+            raise CheckpointError(f"{where}: {name}: expected {wanted}, got {got}")
     return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in expected])

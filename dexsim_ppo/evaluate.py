@@ -21,8 +21,9 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
+from rich.table import Table
 
-from dexsim.core import cli
+from dexsim.core import cli, statistics
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, override, setting
 from dexsim.core.errors import ConfigError
@@ -30,17 +31,15 @@ from dexsim.env.evaluation import evaluation_of
 from dexsim_ppo.learner.networks import zero_carry
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
-from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 
 class Evaluator:
     """Runs evaluation episodes in compiled chunks of so many side by side, by which memory is bounded."""
 
     def __init__(self, env: Environment, chunk: int):
-        self.env, self.chunk = env, chunk
-        self.protocol = evaluation_of(env)
-        self.totals = self.protocol.evaluation == "totals"
-        self._run, self._plans = jit(self._episodes, backend=env.backend), dict[tuple[int, int], Any]()
+        self.env, self.chunk, self.protocol = env, chunk, evaluation_of(env)
+        self._run = jit(self._episodes, backend=env.backend)
+        self._plan = functools.cache(self.protocol.evaluation_plan)  # a run selects its best policy on the same ones
 
     def __call__(
         self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False, label: str = ""
@@ -50,15 +49,11 @@ class Evaluator:
         A `label` shows a progress bar of that name on standard error.
 
         Returns:
-          The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
-          with a 95 % interval by start, and `"task"`: what the task's `summarize` makes of its
-          metrics. And the snapshots of the shown episodes, for `write_video`.
+          The report of `summarize`, and the snapshots of the shown episodes, for `write_video`.
         """
         started, parts = time.perf_counter(), list[Any]()
         count = math.ceil(episodes / self.chunk) * self.chunk
-        if (count, seed) not in self._plans:  # kept, since a run selects its best policy on the same ones
-            self._plans[count, seed] = self.protocol.evaluation_plan(count, seed)
-        plan = self._plans[count, seed]
+        plan = self._plan(count, seed)
         bar = track(
             range(0, count, self.chunk),
             description=f"{label} ({count} episodes)",
@@ -69,39 +64,26 @@ class Evaluator:
         for i in bar:
             part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
             parts.append(jax.device_get(self._run(params, part, idle)))
-        # Episodes are the last axis of all that is measured.
-        metrics, over = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
-        make_report = summarize_totals if self.totals else summarize
-        report = make_report(self.protocol, metrics, over, np.asarray(plan.row))
+        metrics, terminated = jax.tree.map(lambda *xs: np.concatenate(xs, axis=1), *(series for series, _ in parts))
+        report = summarize(self.protocol, metrics, terminated, np.asarray(plan.row))
         report |= {"seed": seed, "seconds": time.perf_counter() - started}
         return report, self._film(*parts[0][1])
 
-    def _episodes(self, params: PolicyParams, plan: Any, idle: bool):
-        """One chunk: what the report needs, and snapshots and termination flags [T, shown].
-
-        The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
-        own totals, only the metrics of each one's last tick [chunk] and the ticks it lasted [chunk].
-        """
+    def _episodes(self, params: PolicyParams, plan: Any, idle: bool) -> tuple[Any, Any]:
+        """One chunk: metrics and termination flags [T, chunk], and snapshots and termination flags [T, shown]."""
         state = self.protocol.evaluation_starts(plan)
         shown = self._extremes(state)
 
         def step(carry, _):
-            state, policy_carry, last = carry
+            state, policy_carry = carry
             policy_carry, action = act(params, policy_carry, state.obs["actor"])
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.protocol.snapshot)(state))
-            series = (dict(state.metrics), state.terminated)
-            film = (frame, state.terminated[shown])
-            if not self.totals:
-                return (state, policy_carry, None), (series, film)
-            return (state, policy_carry, _follow(last, *series)), (None, film)
+            measured = (dict(state.metrics), state.terminated), (frame, state.terminated[shown])
+            return (state, policy_carry), measured
 
-        last: Any = None
-        if self.totals:
-            last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        first: Any = state, zero_carry(params.memory, (self.chunk,)), last
-        (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)
-        return (last[:2] if self.totals else series), film
+        first: Any = state, zero_carry(params.memory, (self.chunk,))
+        return jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)[1]
 
     def _extremes(self, state: Any) -> jax.Array:
         """Two episodes [2] of a chunk: those of the lowest and the highest command, or the first and the last where
@@ -119,12 +101,82 @@ class Evaluator:
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
 
 
-def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
-    """`last` (metrics, episode length, whether ended), one tick later; an ended episode stays as it is."""
-    before, episode_length, ended = last
-    latest = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
-    ended = ended | terminated
-    return latest, episode_length + (~ended).astype(jnp.int32), ended
+# --- the report ---------------------------------------------------------------------------------------
+
+
+def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray) -> dict[str, Any]:
+    """Report of episodes from their metrics [T, N], termination flags [T, N] and starts [N].
+
+    An episode lives up to, and not including, its first terminated step, whose reward belongs to the return.
+
+    Returns:
+      "held" (share of episodes never terminated), "return" and "steps_held", each with a 95 % interval by start, their
+      numbers, and "task": what the task's `summarize` makes of its metrics.
+    """
+    steps, episodes = terminated.shape
+    alive = ~np.logical_or.accumulate(terminated, axis=0)
+    steps_held, starts = alive.sum(axis=0), len(np.unique(start))
+    last = {name: x[np.minimum(steps_held, steps - 1), np.arange(episodes)] for name, x in metrics.items()}
+    if env.evaluation == "totals":
+        own = env.summarize(last, steps_held)
+    else:
+        # A step that diverges ends the episode: it must be counted although the episode does not survive it.
+        entered = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
+        masked = {name: np.where(entered if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
+        own = env.summarize(masked, alive)
+    share = mean_interval(alive[-1], start)
+    if starts == episodes:
+        wilson = statistics.proportion(alive[-1])
+        share = {"value": wilson["mean"], "low": wilson["low"], "high": wilson["high"]}
+    return {
+        "episodes": episodes,
+        "steps": steps,
+        "starts": starts,
+        "held": share | {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)},
+        "return": mean_interval(last["return"], start),
+        "steps_held": mean_interval(steps_held, start),
+        "task": own,
+    }
+
+
+def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
+    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
+    _, which = np.unique(start, return_inverse=True)
+    mean, starts = float(np.mean(x)), int(which.max()) + 1
+    with np.errstate(invalid="ignore"):  # A return beyond float32 is infinite, its interval not a number.
+        off = np.bincount(which, np.asarray(x, float) - mean)
+    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
+    return {"value": mean, "low": mean - half, "high": mean + half}
+
+
+def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
+    """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
+    idle = do_nothing and headline(do_nothing)
+    table = Table("measure", "policy", "95 % interval", *(["doing nothing"] if idle else []), title=title)
+    for name, entry in headline(report).items():
+        low, high = (written(entry | {"value": entry.get(end)}) for end in ("low", "high"))
+        beside = [written(idle.get(name, {"value": None}))] if idle else []
+        table.add_row(name, written(entry), f"{low} .. {high}" if entry.get("high") is not None else "", *beside)
+    Console().print(table)
+    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
+
+
+def written(entry: dict[str, Any]) -> str:
+    """A headline's number with its unit; a share [0, 1] in per cent."""
+    value, unit = entry["value"], entry.get("unit", "")
+    if value is None:
+        return "-"
+    return f"{100 * value:.1f} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
+
+
+def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Names of the task's headline, or else the share held, and the return: value, low, high and unit."""
+    own = report["task"].get("headline") or {"held": report["held"] | {"unit": "%"}}
+    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in own.items()}
+    return rows | {"return": report["return"]}
+
+
+# --- from Python and as a command -----------------------------------------------------------------------
 
 
 def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:
@@ -171,13 +223,12 @@ def evaluate_policy(
     Raises:
       CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
-    arguments = EvaluateArguments(policy="", episodes=episodes, seed=seed, chunk=chunk, baseline=baseline)
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     if env is None:
         env = policy.make_env(backend=backend)
     else:
         policy.check_env(env)
-    return _measure(policy, env, arguments)[0]
+    return _measure(policy, env, episodes, seed, chunk, baseline)[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -216,20 +267,17 @@ class EvaluateArguments(Config):
     """quick: 640 x 480 and few frames. talk: 1920 x 1080 at 30 frames a second, which takes minutes."""
 
 
-def sizes(env: Environment, arguments: EvaluateArguments) -> tuple[int, int]:
-    """Number of episodes, and how many run side by side: on a CPU by default what about a minute suffices for."""
-    chunk, episodes = 1024, 1024
-    if jax.default_backend() != "gpu":
-        chunk, episodes = 64, 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
-    return arguments.episodes or episodes, min(arguments.chunk or chunk, arguments.episodes or chunk)
-
-
-def _measure(policy: Policy, env: Environment, arguments: EvaluateArguments, label: str = "") -> tuple[dict, Any]:
-    """The report, with that of a hand that does nothing, and the film."""
-    episodes, chunk = sizes(env, arguments)
-    measure = functools.partial(Evaluator(env, chunk), policy.params, episodes=episodes, seed=arguments.seed)
+def _measure(
+    policy: Policy, env: Environment, episodes: int, seed: int, chunk: int, baseline: bool, label: str = ""
+) -> tuple[dict, Any]:
+    """The report, with that of a hand that does nothing, and the film; on a CPU by default of as many episodes as about
+    a minute suffices for."""
+    gpu = jax.default_backend() == "gpu"
+    chunk = min(chunk or (1024 if gpu else 64), episodes or 1024)
+    enough = 1024 if gpu else 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
+    measure = functools.partial(Evaluator(env, chunk), policy.params, episodes=episodes or enough, seed=seed)
     report, film = measure(label=label)
-    if arguments.baseline:
+    if baseline:
         report["do_nothing"], _ = measure(idle=True, label=label and "doing nothing")
     return report | {"backend": env.backend}, film
 
@@ -252,7 +300,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     env = policy.make_env(backend=arguments.backend, hand=policy.find_hand(arguments.hand))
-    report, snapshots = _measure(policy, env, arguments, label=arguments.policy)
+    settings = arguments.episodes, arguments.seed, arguments.chunk, arguments.baseline
+    report, snapshots = _measure(policy, env, *settings, label=arguments.policy)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"hand": arguments.hand or None} | cli.environment_report()
     # First the table: a full disk must not cost what was measured.

@@ -13,6 +13,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from string import Template
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ import tyro
 
 from dexsim.calibration.maps import blank_calibration, save_calibration
 from dexsim.core import cli
+from dexsim.core.assets import asset_path
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.core.files import temporary_beside, write_atomic
 from dexsim.core.install import require
@@ -121,42 +123,6 @@ _UNITS = {
     "relative_orientation": "rotation from object to goal, first two columns or (w, x, y, z)",
     "object_orientation": "first two columns of the rotation matrix or (w, x, y, z)",
 }
-_CARD = """# {task}, a policy for the hand {hand.name}
-
-Trained in simulation with dexsim. No action of it has been tried on your hand: begin with the motors' current limited.
-
-`policy.onnx` maps an observation to an action, {rate:g} times a second. `config.json` describes both,
-`calibration.toml` is a template that `dexsim calibrate` fills, and `sha256sum -c SHA256SUMS` checks the files. To run
-it, `pip install numpy onnxruntime`:
-
-```python
-{code}```
-
-The observation has {size} values in SI units and the palm frame (fingers +z, palm normal +x, thumb side +y):
-
-| field | values | unit | measured by |
-|---|---|---|---|
-{rows}
-
-The action moves the targets of the joints, in the order of `joints` in `config.json`. Build the observation with the
-last action before you choose the next one.
-
-Training: {training}
-"""
-_CODE = """import json
-import numpy as np
-import onnxruntime
-config = json.load(open("config.json"))
-lower, upper = np.array([[joint["lower"], joint["upper"]] for joint in config["joints"]]).T
-session = onnxruntime.InferenceSession("policy.onnx")
-carry = {x.name: np.zeros((1, x.shape[1]), np.float32) for x in session.get_inputs()[1:]}  # empty without memory
-def act(observation, carry):
-    action, *after = session.run(None, {"observation": np.float32([observation]), **carry})
-    return action[0], dict(zip(carry, after))
-def move(target, action, measured):
-    target = np.clip(target + config["step"] * action, measured - config["reach"], measured + config["reach"])
-    return np.clip(target, lower, upper)  # rad
-"""
 
 
 def write_bundle(policy: Policy, path: Path) -> None:
@@ -215,11 +181,10 @@ def _card(policy: Policy, hand: Hand) -> str:
     config = bundle_config(policy, hand)
     rows = [f"| `{x['name']}` | {x['size']} | {x['unit']} | {x['source']} |" for x in config["observation"]]
     origin = {name: value for name, value in policy.training.items() if isinstance(value, (int, float, str))}
-    return _CARD.format(
+    return Template(asset_path("bundle/README.md").read_text()).substitute(
         task=policy.task,
-        hand=hand,
-        rate=policy.control_rate,
-        code=_CODE,
+        hand=hand.name,
+        rate=f"{policy.control_rate:g}",
         size=sum(x["size"] for x in config["observation"]),
         rows="\n".join(rows),
         training=", ".join(f"{name} {value}" for name, value in origin.items()) or "see `config.json`",

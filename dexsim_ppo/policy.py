@@ -126,14 +126,8 @@ class Policy(Config):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The numbers of its file by name; see `dexsim_ppo.portable`."""
-        params = self.params
-        arrays = {"mean": params.normalizer.mean, "std": params.normalizer.std}
-        for i, layer in enumerate(params.layers):
-            arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
-        if params.memory is not None:
-            for part, layer in (("input", params.memory.input), ("recurrent", params.memory.recurrent)):
-                arrays |= {f"{part}_kernel": layer.kernel, f"{part}_bias": layer.bias}
-        return {name: np.asarray(array) for name, array in arrays.items()}
+        names = _names(len(self.params.layers), self.params.memory is not None, self.params.normalizer.clip)
+        return dict(zip(jax.tree.leaves(names), map(np.asarray, jax.tree.leaves(self.params)), strict=True))
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
@@ -246,18 +240,22 @@ def _find(name: str | Path) -> Path:
 
 
 def _from_file(file: checkpoint.Checkpoint) -> Policy:
+    header, paths = dict(file.content), file.leaves.keys()
+    count = sum(path.startswith("['kernel_") for path in paths)
+    names = _names(count, "['recurrent_kernel']" in paths, header.pop("clip"))
     # The path of a dictionary's leaf is ['mean'].
-    arrays = {path.strip("[']"): jnp.asarray(array) for path, array in file.leaves.items()}
-    layer = lambda kernel, bias: Layer(arrays[kernel], arrays[bias])  # noqa: E731
-    count = sum(name.startswith("kernel_") for name in arrays)
-    memory = None
-    if "recurrent_kernel" in arrays:
-        memory = GRU(layer("input_kernel", "input_bias"), layer("recurrent_kernel", "recurrent_bias"))
-    header = dict(file.content)
-    normalizer = Normalizer(arrays["mean"], arrays["std"], header.pop("clip"))
-    params = PolicyParams(tuple(layer(f"kernel_{i}", f"bias_{i}") for i in range(count)), normalizer, memory)
+    params = jax.tree.map(lambda name: jnp.asarray(file.leaves[f"['{name}']"]), names)
     layout = tuple(LayoutEntry(*entry) for entry in header.pop("observation_layout"))
     return Policy(task=file.task, observation_layout=layout, params=params, **header)
+
+
+def _names(layers: int, memory: bool, clip: float) -> PolicyParams:
+    """The names of a file's arrays in place of the arrays."""
+    named: Any = Layer
+    layer = lambda kind, index="": named(f"{kind}kernel{index}", f"{kind}bias{index}")  # noqa: E731
+    unit = GRU(layer("input_"), layer("recurrent_")) if memory else None
+    normalizer = Normalizer(cast(Any, "mean"), cast(Any, "std"), clip)
+    return PolicyParams(tuple(layer("", f"_{i}") for i in range(layers)), normalizer, unit)
 
 
 def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:

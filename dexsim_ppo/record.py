@@ -26,9 +26,8 @@ from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import require
 from dexsim.datasets.episodes import Episodes, write_episodes
-from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, from_readings, write_lerobot
 from dexsim.datasets.rerun import show_rerun
-from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
 from dexsim.hand.mjcf import hand_poses
 from dexsim.render.picture import draw_scene

@@ -9,6 +9,7 @@ Writes `runs/<task>-<time>/`: configuration, metrics, checkpoints, best and last
 import argparse
 import contextlib
 import dataclasses
+import datetime
 import json
 import shlex
 import signal
@@ -41,14 +42,15 @@ from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import (
     TrainArguments,
     arguments_from_dict,
+    check_network,
     check_resumed,
     find_hand,
+    fine_tuning_config,
     printable,
     training_config,
 )
-from dexsim_ppo.training.fine_tune import check_network, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
-from dexsim_ppo.training.runlog import RunFolder, check_new, folder_of, new_folder
+from dexsim_ppo.training.runlog import RunFolder
 from dexsim_ppo.training.trainer import Run
 
 Source = checkpoint.Checkpoint | Policy | None
@@ -99,14 +101,9 @@ def train_policy(
     if not (task or source):
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
-    given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)}
+    given = {"env": config, "ppo": ppo, "policy": str(policy) or None} | options
     default = _with_budget(default, {name for name, value in options.items() if value is not None})
-    if options.get("run_dir"):
-        options["run_dir"] = Path(options["run_dir"])
-    given |= options
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
-    if isinstance(source, checkpoint.Checkpoint):
-        check_resumed(arguments, default)
     run = make_run(arguments, source, started, "train_policy(...)")
     if train_run(run, source, "train_policy(...)"):
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -119,14 +116,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     given = {argument.split("=")[0] for argument in argv}
     if not given & {"--task", "--resume", "--policy", "--config", "-h", "--help"}:
-        print(
-            f"give a task: {', '.join(catalog()['tasks'])}\n"
-            "for example: python -m dexsim_ppo.train --task grasp\n"
-            "or a run to continue (--resume), a policy to fine-tune (--policy), a run whose options to use (--config); "
-            "--help lists all options",
-            file=sys.stderr,
+        raise ConfigError(
+            f"give a task (--task, one of {', '.join(catalog()['tasks'])}), a run to continue (--resume), a policy to "
+            "fine-tune (--policy), or a run whose options to use (--config); --help lists all options"
         )
-        return 2
     cli.enable_caches()
     if "--devices" in given:
         processes.connect()
@@ -146,12 +139,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make_run(arguments: TrainArguments, source: Source, started: float, command: str) -> Run:
     """A run with its folder, ready to train."""
-    resumed, first = source if isinstance(source, checkpoint.Checkpoint) else None, processes.is_first()
+    new = processes.is_first() and not isinstance(source, checkpoint.Checkpoint)
     # Errors come before the environment is made, which takes seconds.
-    if resumed and arguments.run_dir:
-        raise ConfigError(f"--run-dir {arguments.run_dir}: a resumed run stays in its folder")
-    if first:
-        check_new(arguments.run_dir)
+    if isinstance(source, checkpoint.Checkpoint):
+        check_resumed(arguments, default_arguments(None, arguments.preset, source))
+        if arguments.run_dir:
+            raise ConfigError(f"--run-dir {arguments.run_dir}: a resumed run stays in its folder")
+        folder = RunFolder(source.path.resolve().parent.parent)
+        if not folder.config.exists():
+            raise ConfigError(f"--resume {source.path}: {folder.path} has no {folder.config.name}, which a run needs")
+    else:
+        name = f"{arguments.task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        folder = RunFolder(arguments.run_dir or Path("runs") / name)
+        if new and folder.path.exists():
+            raise ConfigError(f"--run-dir {folder.path}: exists already; choose another, or resume it with --resume")
     if arguments.wandb:
         require("wandb", "wandb", f"--wandb {arguments.wandb}")
     if arguments.deterministic and not make_deterministic():
@@ -167,14 +168,8 @@ def make_run(arguments: TrainArguments, source: Source, started: float, command:
     if isinstance(source, Policy):
         source.check_fit(env)
         check_network(source, arguments.ppo)
-    path = Path()  # Only the first process writes.
-    if resumed:
-        path = folder_of(resumed.path)
-    elif first:
-        path = new_folder(arguments.run_dir, arguments.task)
-    folder = RunFolder(path)
-    if first and not resumed:
-        folder.checkpoints.mkdir()
+    if new:
+        folder.checkpoints.mkdir(parents=True)
         record = {"command": command, "arguments": printable(arguments), "hand": record_of(hand)}
         cli.write_json(folder.config, record | cli.environment_report())
     return Run(env, arguments, folder, started, mesh)
@@ -284,10 +279,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, Source]:
     generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
     options = generic[type(default.env)]
     arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
-    arguments = dataclasses.replace(arguments, task=default.task)
-    if isinstance(source, checkpoint.Checkpoint):
-        check_resumed(arguments, default)
-    return arguments, source
+    return dataclasses.replace(arguments, task=default.task), source
 
 
 if __name__ == "__main__":

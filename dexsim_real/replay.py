@@ -20,9 +20,8 @@ from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
 from dexsim.core.config import from_dict
-from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+from dexsim.datasets.lerobot import check_lerobot, from_readings, write_lerobot
 from dexsim.datasets.rerun import show_rerun
-from dexsim.datasets.trajectory import from_readings
 from dexsim.hand.source import recorded_hand
 from dexsim.observation import Readings, layout
 from dexsim.task_spec import TaskSpec

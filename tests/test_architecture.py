@@ -36,7 +36,7 @@ FLOORS = {
     ),
     "dexsim_ppo": (
         ("learner", "portable"),
-        ("checkpoint", "report"),
+        ("checkpoint",),
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),

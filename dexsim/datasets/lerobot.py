@@ -1,4 +1,4 @@
-"""Trajectories in the LeRobot dataset format, version 3.0, without torch and without LeRobot.
+"""Trajectories of a simulation or of a hand, and the LeRobot dataset format, version 3.0, without torch and LeRobot.
 
 Touch is laid out as LeRobot's open proposal for tactile sensors has it (huggingface/lerobot, pull request 4469, in its
 state of August 2026): a feature `observation.tactile.NAME` for each sensor, a set of points with a force vector each,
@@ -7,6 +7,7 @@ that frame, is in `meta/tactile.json`, which is our own addition. LeRobot's ACT 
 `observation.environment_state`, or pictures, which are PNG files in the table.
 """
 
+import dataclasses
 import io
 import json
 import shutil
@@ -19,7 +20,6 @@ import numpy as np
 from dexsim.core.errors import DexsimError
 from dexsim.core.files import temporary_beside
 from dexsim.core.install import require
-from dexsim.datasets.trajectory import Trajectory
 from dexsim.hand.description import Hand
 
 VERSION = "v3.0"
@@ -29,6 +29,39 @@ _PICTURE = "observation.images.scene"
 _SAMPLED = 20  # pictures of an episode, at most, of which its statistics are
 _FILE = "chunk-000/file-000.parquet"
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """What was measured at each of T ticks, and the joint targets that followed; F fingers of N taxels. NumPy."""
+
+    time: np.ndarray  # [T] s since the first tick
+    joint_position: np.ndarray  # [T, J] rad
+    joint_torque: np.ndarray  # [T, J] 1, over the torque limit
+    taxel_force: np.ndarray  # [T, F, N] N, along the inward normal
+    object_position: np.ndarray  # [T, 3] m, palm frame, as estimated
+    object_quat: np.ndarray  # [T, 4] (w, x, y, z), as estimated
+    command: np.ndarray  # [T] in [0, 1]
+    target: np.ndarray  # [T, J] rad
+    picture: np.ndarray | None = None  # [T] of a camera, each a PNG file's bytes
+
+    def at_rate(self, rate: float) -> "Trajectory":
+        """The same at another rate, Hz: of each instant the nearest tick."""
+        instants = np.arange(int(self.time[-1] * rate) + 1) / rate
+        nearest = np.rint(np.interp(instants, self.time, np.arange(len(self.time)))).astype(int)
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        picked: dict[str, Any] = {name: None if values is None else values[nearest] for name, values in fields.items()}
+        return Trajectory(**picked | {"time": instants})
+
+
+READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat", "command")
+"""Fields that a trajectory takes from the readings of a tick."""
+
+
+def from_readings(time: np.ndarray, readings: Sequence[dict], target: np.ndarray) -> Trajectory:
+    """A trajectory of T ticks' readings, as dictionaries, and joint targets [T, J] rad."""
+    fields = {name: np.stack([np.asarray(now[name], np.float32) for now in readings]) for name in READINGS}
+    return Trajectory(time=np.asarray(time, float), target=np.asarray(target, np.float32), **fields)
 
 
 def check_lerobot(folder: Path) -> None:

@@ -71,8 +71,8 @@ class ObjectConfig(Config):
     """Sliding friction between all else of the hand (palm, links) and the object."""
     stiffness: Range = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
     """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Fingertips
-    follow their skin (`contact.follow_skin`): the middle of the default is the skin as it is, and other values make it
-    that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
+    follow their skin (`Physics.tip_stiffness`): the middle of the default is the skin as it is, and other values make
+    it that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
     restitution: Range = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution: the damping of the contact, which also slows creep. Values
     below 0.024 act as 0.024."""

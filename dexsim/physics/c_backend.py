@@ -12,7 +12,6 @@ waiting for the callback: a deadlock. It also keeps programs out of JAX's compil
 of the process. An FFI call does neither, and gets XLA's buffers as NumPy arrays without a copy.
 """
 
-import collections
 import contextlib
 import dataclasses
 import functools
@@ -20,7 +19,6 @@ import hashlib
 import math
 import os
 import threading
-import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -40,7 +38,6 @@ from dexsim.physics.interface import (
     PhysicsState,
     StepResult,
     places,
-    without_gradient,
 )
 from dexsim.physics.law import evaluator, record
 
@@ -64,35 +61,28 @@ class CBackend:
         if model.body_simple[scene.object_body]:
             raise AssetError(f"{scene.hand.model_path}: backend c: the object's inertia was compiled as diagonal")
         self.scene, self._key, self._fields = scene, _digest(scene), tuple(places(scene))
-        self._engine = _engines.get(self._key) or HostEngine(scene)
-        _engines[self._key] = self._engine
-        _newest.append(self._engine)
+        _scenes[self._key] = scene
         ffi.register(TARGET, "cpu", _serve)
-        self._tick = without_gradient("c", self._call, 1)
 
     def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick in one call."""
+        # Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the whole
+        # batch shares.
         recorded = record(law, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
-        given = [fields[name] for name in self._fields]
-        arguments = [*given, state.qpos, state.qvel, state.warmstart, push, *recorded.constants]
-        *after, force = self._tick(recorded.text, *map(jnp.asarray, arguments))
+        moving = [state.qpos, state.qvel, state.warmstart]
+        arguments = [*(fields[name] for name in self._fields), *moving, push, *recorded.constants]
+        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in moving]
+        results.append(jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state.qpos.dtype))
+        call = jax.ffi.ffi_call(TARGET, results, vmap_method="expand_dims")
+        *after, force = call(*map(jnp.asarray, arguments), scene=self._key, law=recorded.text)
         return StepResult(PhysicsState(*after), force)
-
-    def _call(self, law: str, *arguments: jax.Array) -> list[jax.Array]:
-        """Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the
-        whole batch shares."""
-        count = len(self._fields)
-        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[count : count + 3]]
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
-        call = jax.ffi.ffi_call(TARGET, [*state, force], vmap_method="expand_dims")
-        return list(call(*arguments, engine=self._key, law=law))
 
 
 class _Worlds:
     """Worlds that differ in some fields of the model, and the arrays through which they are written and read."""
 
     def __init__(self, scene: PhysicsScene, size: int):
-        self.process = os.getpid()
+        self.scene, self.process = scene, os.getpid()
         # One thread for each core that this process may use.
         self.batch = Batch(scene.model, size, available_cores())
         where = places(scene)
@@ -105,76 +95,55 @@ class _Worlds:
         self.torque, self.wrench = self.batch.bind("qfrc_applied"), self.batch.bind("xfrc_applied")
         self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
 
-    def configure(self, values: list[np.ndarray]) -> None:
-        """Write the models' fields."""
-        for targets, value in zip(self._fields.values(), values, strict=True):
-            for array, where in targets:
-                array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
-
-
-class HostEngine:
-    """One scene. `tick` is what a compiled program calls."""
-
-    def __init__(self, scene: PhysicsScene):
-        """`scene` has a contact sensor for each fingertip."""
-        self.scene, self._count = scene, len(places(scene))
-        self._worlds = functools.lru_cache(maxsize=8)(functools.partial(_Worlds, scene))
-
-    def tick(self, law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
-        """A control tick of a batch; see `CBackend._call` for what crosses.
+    def tick(self, law: bytes, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step.
 
         Raises:
           RuntimeError: in a forked child, which has none of its parent's threads.
         """
-        shape = out[0].shape[:-1]
-        inputs = [_flatten(x, shape) for x in arguments]
-        with _lock, _no_warnings():
-            worlds = self._worlds(math.prod(shape))
-            if worlds.process != os.getpid():
-                raise RuntimeError(
-                    "backend 'c' does not work in a forked process, which lacks its threads: "
-                    "start processes with multiprocessing.get_context('spawn')"
-                )
-            worlds.configure(inputs[: self._count])
-            results = self._run(worlds, law, inputs[self._count :])
-            for target, value in zip(out, results, strict=True):
-                target[...] = value.reshape(target.shape)
-
-    def _run(self, worlds: _Worlds, law: bytes, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step."""
-        scene, warning = self.scene, worlds.batch.warning[..., 1]
-        qpos, qvel, warmstart, push, *constants = inputs
-        worlds.qpos[:], worlds.qvel[:], worlds.warmstart[:] = qpos, qvel, warmstart
-        worlds.wrench[:, scene.object_body, :3] = push
+        if self.process != os.getpid():
+            raise RuntimeError(
+                "backend 'c' does not work in a forked process, which lacks its threads: "
+                "start processes with multiprocessing.get_context('spawn')"
+            )
+        for targets, value in zip(self._fields.values(), inputs, strict=False):
+            for array, where in targets:
+                array[(slice(None), *(where if isinstance(where, tuple) else (where,)))] = value
+        scene, warning = self.scene, self.batch.warning[..., 1]
+        qpos, qvel, warmstart, push, *constants = inputs[len(self._fields) :]
+        self.qpos[:], self.qvel[:], self.warmstart[:] = qpos, qvel, warmstart
+        self.wrench[:, scene.object_body, :3] = push
         warning[:] = 0
         motors, dofs = evaluator(law)(constants), scene.joint_dof
         armature = scene.model.dof_armature[dofs]
         for substep in range(scene.config.substeps):
-            position = worlds.qpos[:, scene.joint_qpos].astype(qpos.dtype)
-            velocity = worlds.qvel[:, dofs].astype(qvel.dtype)
-            worlds.torque[:, dofs], inertia = motors(substep, position, velocity)
-            worlds.armature[:, dofs] = armature + inertia
-            worlds.batch.step()
+            position = self.qpos[:, scene.joint_qpos].astype(qpos.dtype)
+            velocity = self.qvel[:, dofs].astype(qvel.dtype)
+            self.torque[:, dofs], inertia = motors(substep, position, velocity)
+            self.armature[:, dofs] = armature + inertia
+            self.batch.step()
         if warning[:, _FULL].any():
             raise MemoryError("C MuJoCo has no room for all contacts: raise <size memory> in the hand's MJCF")
-        force = -worlds.sensors
+        force = -self.sensors
         force[warning[:, _DIVERGED].any(1)] = np.nan
-        return [worlds.qpos, worlds.qvel, worlds.warmstart, force]
+        return [self.qpos, self.qvel, self.warmstart, force]
 
 
-# Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
-_engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
-# A program may still be running, asynchronously, when its environment is gone already.
-_newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
+# Programs name their scene by a hash, so that one that was loaded from a cache finds it. Scenes stay: a program may
+# still be running, asynchronously, when its environment is gone already.
+_scenes: dict[str, PhysicsScene] = {}
+_worlds = functools.lru_cache(maxsize=8)(lambda key, size: _Worlds(_scenes[key], size))
 
 
 def _serve(frame: Any) -> None:
-    """A call of XLA's (`CBackend._call`)."""
-    attributes = ffi.attributes(frame)
-    engine = _engines.get(attributes["engine"].decode())
-    if engine is None:
-        raise RuntimeError("backend 'c': the environment of this program no longer exists")
-    engine.tick(attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
+    """A control tick of a batch; see `CBackend.advance` for what crosses."""
+    attributes, out = ffi.attributes(frame), ffi.arrays(frame.results)
+    shape = out[0].shape[:-1]
+    inputs = [_flatten(x, shape) for x in ffi.arrays(frame.arguments)]
+    with _lock, _no_warnings():
+        worlds = _worlds(attributes["scene"].decode(), math.prod(shape))
+        for target, value in zip(out, worlds.tick(attributes["law"], inputs), strict=True):
+            target[...] = value.reshape(target.shape)
 
 
 def _digest(scene: PhysicsScene) -> str:

@@ -2,12 +2,10 @@
 
 A spring of constant stiffness gives the same force on a face, over its rim and at its corner. Skin does not: at equal
 depth the rim presses half as hard, the corner a quarter. So the stiffness of a fingertip's springs is computed at every
-tick from the skin's law over the taxels (`follow_skin`), and the solver's force is that of the skin. For this a
-fingertip is a row of spheres (`split_pads`). A sphere has exactly one contact point with a primitive, on every engine,
-at a depth in closed form; a capsule has one or two points on a box.
+tick from the skin's law over the taxels (`Physics.tip_stiffness`), and the solver's force is that of the skin. For
+this a fingertip is a row of spheres (`split_pads`). A sphere has exactly one contact point with a primitive, on every
+engine, at a depth in closed form; a capsule has one or two points on a box.
 """
-
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +14,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.core.pytree import Array
-from dexsim.geometry import rotations, sdf
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import HandPose
-from dexsim.objects.params import ObjectParams
 
 # One sphere's share of a fingertip's stiffness: two or three of a row touch at once.
 ROW_SHARE = 0.5
@@ -143,16 +138,9 @@ def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str]) -> list[str
     return names
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Pads:
-    """The spheres of the fingertips, in the frames of their links; fingers with fewer have radii of 0."""
-
-    centre: np.ndarray  # [F, S, 3] m
-    radius: np.ndarray  # [F, S] m
-
-
-def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pads:
-    """The spheres on bodies `tips` [F] that are part of `pairs`."""
+def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The spheres on bodies `tips` [F] that are part of `pairs`: centres [F, S, 3] m in the frames of their links, and
+    radii [F, S] m, 0 for fingers with fewer."""
     used = np.unique([model.pair_geom1[pairs], model.pair_geom2[pairs]])
     used = used[model.geom_type[used] == mujoco.mjtGeom.mjGEOM_SPHERE]
     rows = [used[model.geom_bodyid[used] == tip] for tip in tips]
@@ -160,41 +148,4 @@ def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pad
     centre, radius = np.zeros((len(rows), longest, 3), np.float32), np.zeros((len(rows), longest), np.float32)
     for finger, row in enumerate(rows):
         centre[finger, : len(row)], radius[finger, : len(row)] = model.geom_pos[row], model.geom_size[row, 0]
-    return Pads(centre, radius)
-
-
-def follow_skin(
-    hand: Hand,
-    pads: Pads,
-    pose: HandPose,
-    object: ObjectParams,
-    position: jax.Array,
-    rotation: jax.Array,
-    skin_force: jax.Array,
-    pad_thickness_delta: jax.Array | float = 0.0,
-) -> jax.Array:
-    """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
-
-    The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the ratio is
-    S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet. The first half millimetre blends.
-
-    Args:
-      pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
-      skin_force: [F] N, S: what the skin presses with there (`dexsim.touch.skin`).
-      pad_thickness_delta: [] m, change of the rubber's thickness from `pads`.
-    """
-    shape, radius = object.shape(), jnp.asarray(pads.radius)
-    radius = jnp.where(radius > 0, radius + pad_thickness_delta, 0.0)
-    centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
-        pose.tip_rotation[:, None], jnp.asarray(pads.centre)
-    )
-    local = sdf.to_local(centre, position, rotation)
-    depth: jax.Array | float = 0.0
-    for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
-        here = sdf.to_local(local, shape.position[k], shape.rotation[k])
-        gap = sdf.primitive_distance(kind, here, shape.size[k])
-        depth += jnp.where(shape.active[k], jnp.maximum(radius - gap, 0.0), 0.0)
-    nominal = NOMINAL * ROW_SHARE
-    ratio = (skin_force + nominal * BLEND_DEPTH) / (nominal * (jnp.sum(depth, -1) + BLEND_DEPTH))
-    has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
-    return jnp.where(has, jnp.clip(ratio, SOFTEST, STIFFEST), 1.0)
+    return centre, radius

@@ -156,7 +156,6 @@ def _answer(handler: Callable[[Any], None], traits: int, address: int) -> int | 
     return None
 
 
-_kept: list[Any] = []  # what C holds addresses of
 _ending = threading.Event()
 _calls: collections.deque[float] = collections.deque(maxlen=1)  # s, when the last call came
 _QUIET, _PATIENCE = 0.3, 5.0  # s, without a call before the interpreter may end, and the longest wait for that
@@ -177,13 +176,12 @@ def _end() -> None:
 
 
 @functools.cache
-def register(target: str, platform: str, handler: Callable[[Any], None], traits: int = 0) -> None:
+def register(target: str, platform: str, handler: Callable[[Any], None], traits: int = 0) -> Any:
     """Make `handler`, which gets a `Frame`, what calls of `target` on a platform run; once in a process.
 
-    `traits` is `XLA_FFI_Handler_TraitsBits`.
+    `traits` is `XLA_FFI_Handler_TraitsBits`. The result, which C has the address of, stays in the cache.
     """
     function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(functools.partial(_answer, handler, traits))
-    if not _kept:
-        atexit.register(_end)
-    _kept.append(function)
+    atexit.register(_end)
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(function), platform=platform)
+    return function

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.hand.description import Hand
 from dexsim.physics.config import PhysicsConfig
@@ -117,14 +116,3 @@ def configured(scene: PhysicsScene, fields: Fields) -> dict[str, jax.Array]:
         name: jnp.asarray(getattr(scene.model, name), jnp.float32).at[where[name]].set(value)
         for name, value in fields.items()
     }
-
-
-def without_gradient(backend: str, tick: Callable, static: int) -> Callable:
-    """`tick`, whose derivative is an error; its first `static` arguments are no arrays."""
-
-    def refuse(*_: Any) -> Any:
-        raise ConfigError(f"backend {backend!r} has no gradient")
-
-    refusing = jax.custom_jvp(tick, nondiff_argnums=tuple(range(static)))
-    refusing.defjvp(refuse)
-    return refusing

@@ -1,7 +1,7 @@
 """The motors' law as a list of operations: traced by JAX, evaluated by NumPy, printed as CUDA.
 
 Motors have one source, which JAX traces for every engine. `record` writes the traced law down, so that engines can
-evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `dexsim.physics.cuda.law`. All work
+evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `cuda.program.print_law`. All work
 in the same precision and order; results differ where XLA fuses a product and a sum, by a rounding.
 
 A law works element by element on scalars and on vectors over the joints. So one joint's torque takes one element of
@@ -112,10 +112,7 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
 
     def number(variable: Any) -> int:
         """The next number, for a value of this type."""
-        shape, dtype = variable.aval.shape, str(variable.aval.dtype)
-        if shape not in ((), joints.shape) or dtype not in _TYPES:
-            raise _unknown(f"an array {list(shape)} {dtype}: expected [] or {list(joints.shape)}, {', '.join(_TYPES)}")
-        types.append([bool(shape), dtype])
+        types.append([bool(variable.aval.shape), str(variable.aval.dtype)])
         return len(types) - 1
 
     def run(jaxpr: Any, inputs: list[int]) -> list[int]:
@@ -125,8 +122,6 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
         def read(variable: Any) -> int:
             if not hasattr(variable, "val"):
                 return names[variable]
-            if np.ndim(variable.val):
-                raise _unknown("an array that is written into it")
             literals.append([number(variable), np.asarray(variable.val).item()])
             return literals[-1][0]
 
@@ -136,7 +131,11 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
             if inner is not None and equation.primitive.name in _CALLS and not inner.consts:
                 results = run(inner.jaxpr, operands)
             else:
-                _check_operation(equation)
+                if not _is_elementwise(equation, joints.shape):
+                    raise ConfigError(
+                        f"a motor law with {equation.primitive.name}: backends c and cuda take laws of element-wise "
+                        f"operations on [] and {list(joints.shape)}; choose backend mjx"
+                    )
                 results = [number(equation.outvars[0])]
                 steps.append([equation.primitive.name, operands, results[0]])
             names.update(zip(equation.outvars, results, strict=True))
@@ -147,18 +146,14 @@ def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
     return Recorded(traced.consts, literals, steps, types, torque, inertia)
 
 
-def _check_operation(equation: Any) -> None:
+def _is_elementwise(equation: Any, joints: tuple[int, ...]) -> bool:
+    """Whether it works joint by joint, on scalars and vectors [J] of `_TYPES` alone."""
     kind, operands = equation.primitive.name, equation.invars
-    if kind not in OPERATIONS and not (kind in _SAME and len(operands) == 1):
-        raise _unknown(kind)
-    if kind in _LOGICAL and (operands[0].aval.dtype != bool or len(operands) > 3):
-        raise _unknown(f"{kind} of {operands[0].aval.dtype}")
-
-
-def _unknown(what: str) -> ConfigError:
-    return ConfigError(
-        f"a motor law with {what}: backends c and cuda take laws of element-wise operations; choose backend mjx"
-    )
+    values = [variable.aval for variable in (*operands, *equation.outvars)]
+    if kind in _LOGICAL and (values[0].dtype != bool or len(operands) > 3):
+        return False
+    typed = all(value.shape in ((), joints) and str(value.dtype) in _TYPES for value in values)
+    return typed and (kind in OPERATIONS or (kind in _SAME and len(operands) == 1))
 
 
 BatchLaw = Callable[[int, np.ndarray, np.ndarray], list[np.ndarray]]

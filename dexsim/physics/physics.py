@@ -6,7 +6,6 @@ tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device).
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ import numpy as np
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.core.pytree import choose
+from dexsim.geometry import rotations, sdf
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams, bounding_radius
@@ -22,7 +22,7 @@ from dexsim.physics import contact
 from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.backend import CudaBackend
-from dexsim.physics.interface import Backend, Fields, PhysicsScene, PhysicsState, StepResult, TorqueLaw, configured
+from dexsim.physics.interface import Backend, Fields, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.law import implicit
 from dexsim.physics.model import build_scene
 
@@ -95,7 +95,7 @@ class Physics:
         self._compliance, self._share, self._finger_of_pair = contact.pair_constants(
             scene.model, scene.object_pairs, scene.tip_bodies
         )
-        self._pads = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
+        self._pad_centre, self._pad_radius = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
 
     def advance(
         self,
@@ -167,10 +167,6 @@ class Physics:
             "pair_solimp": solimp,
         }
 
-    def configure(self, object: ObjectParams, *changes: Any) -> dict[str, jax.Array]:
-        """The whole fields of one environment's model, by the names of `mujoco.MjModel`; arguments as in `fields`."""
-        return configured(self.scene, self.fields(object, *changes))
-
     def tip_stiffness(
         self,
         object: ObjectParams,
@@ -180,10 +176,32 @@ class Physics:
         skin_force: jax.Array,
         pad_thickness_delta: jax.Array | float = 0.0,
     ) -> jax.Array:
-        """How much stiffer [F] than nominal the fingertips' springs are for their sum to be the skin's force; arguments
-        as in `contact.follow_skin`."""
-        delta = self._delta(pad_thickness_delta)
-        return contact.follow_skin(self.hand, self._pads, pose, object, position, rotation, skin_force, delta)
+        """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
+
+        The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the ratio is
+        S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet. The first half millimetre blends.
+
+        Args:
+          pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
+          skin_force: [F] N, S: what the skin presses with there (`dexsim.touch.skin`).
+          pad_thickness_delta: [] m, see `fields`.
+        """
+        shape, radius = object.shape(), jnp.asarray(self._pad_radius)
+        radius = jnp.where(radius > 0, radius + self._delta(pad_thickness_delta), 0.0)
+        centre = pose.body_position[self.hand.tip_body][:, None] + rotations.rotate(
+            pose.tip_rotation[:, None], jnp.asarray(self._pad_centre)
+        )
+        local = sdf.to_local(centre, position, rotation)
+        depth: jax.Array | float = 0.0
+        for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
+            here = sdf.to_local(local, shape.position[k], shape.rotation[k])
+            gap = sdf.primitive_distance(kind, here, shape.size[k])
+            depth += jnp.where(shape.active[k], jnp.maximum(radius - gap, 0.0), 0.0)
+        nominal = contact.NOMINAL * contact.ROW_SHARE
+        blend = nominal * contact.BLEND_DEPTH
+        ratio = (skin_force + blend) / (nominal * (jnp.sum(depth, -1) + contact.BLEND_DEPTH))
+        has = jnp.asarray(self._pad_radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
+        return jnp.where(has, jnp.clip(ratio, contact.SOFTEST, contact.STIFFEST), 1.0)
 
     def _delta(self, pad_thickness_delta: jax.Array | float) -> jax.Array:
         # No rubber is the least.

@@ -49,9 +49,9 @@ def render_frame(
       force_range: force of the hottest taxel colour [N]; the snapshot's largest taxel force when left out.
 
     Raises:
-      ValueError: a size without room for the scene, or kinds that do not match the snapshot.
+      ValueError: a size without room for the scene.
     """
-    frame = _finite(snapshot)
+    frame = snapshot.map(np.asarray)
     finger_range = float(np.nanmax(np.append(frame.finger_force, frame.target_force)))
     draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
     return draw(frame, hand_poses(hand, frame.joint_position[None])[0])
@@ -76,7 +76,7 @@ def render_episode(
       ValueError: no snapshots, or see `render_frame`.
       OSError: the file cannot be written.
     """
-    snapshots = _finite(snapshots)
+    snapshots = snapshots.map(np.asarray)
     total = len(snapshots.joint_position)
     if total == 0:
         raise ValueError("render_episode: no snapshots to draw")
@@ -125,8 +125,6 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
     panel_width = height // 2
     if width % 2 or height % 2 or width - panel_width < height // 4 or height < 120:
         raise ValueError(f"size: {width}x{height} must be even, at least 120 high and 0.75 times as wide as high")
-    if np.shape(snapshot.primitive_size)[-2] != len(kinds):
-        raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
     camera = camera_of(camera, hand) if isinstance(camera, str) else camera
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
     finger_range = finger_range or 1.0
@@ -146,13 +144,6 @@ def camera_of(task: str, hand: Hand) -> Camera:
         return camera
     moved = np.asarray(camera.target) + np.asarray(hand.grasp_centre) - _GRASP_CENTRE
     return dataclasses.replace(camera, target=tuple(moved.tolist()))
-
-
-def _finite(snapshot: Snapshot) -> Snapshot:
-    """NumPy arrays with zeros for what is not finite (a broken simulation must still be shown), but for the target."""
-    arrays = snapshot.map(np.asarray)
-    clean = arrays.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x)
-    return dataclasses.replace(clean, target_force=arrays.target_force)
 
 
 def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float, size: tuple[int, int]) -> Path:

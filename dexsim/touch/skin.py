@@ -23,7 +23,7 @@ class Skin(Config):
 
     c10: float = setting(0.003e6, unit="Pa", low=0.0, high=1e8)
     """First Mooney-Rivlin coefficient; that of the XHand's skin is not published. The fingertips' stiffness in the
-    physics follows from it (`contact.follow_skin`): a face presses an outer finger with 1 N at 1 mm and 6 N at 2 mm,
+    physics follows from it (`Physics.tip_stiffness`): a face presses an outer finger with 1 N at 1 mm and 6 N at 2 mm,
     its rim with half of that."""
     c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
     """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where

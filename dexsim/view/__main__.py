@@ -20,7 +20,7 @@ from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.install import require
 
 if TYPE_CHECKING:
-    from dexsim.view.source import Source
+    from dexsim.view.viewer import Source
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ def open_source(arguments: ViewArguments) -> "Source":
 
         return Emulation(name, arguments.seed, arguments.hand)
     from dexsim.hand.load import load_hand
-    from dexsim.registry import find_task, make
+    from dexsim.registry import make
     from dexsim.view.simulation import NONE, Simulation, find_policies
     from dexsim_ppo.policy import load_policy
 
@@ -73,30 +73,20 @@ def open_source(arguments: ViewArguments) -> "Source":
         # "grasp" is a task and also a policy, which is of the XHand: on another hand the task is shown.
         if Path(name).exists() or (isinstance(error, ConfigError) and not arguments.hand):
             raise
-        try:
-            environment = find_task(name).environment
-        except ConfigError as error:
-            raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
-        if environment:
-            raise ConfigError(f"{name}: cannot be shown: not a task on a hand") from None
-        env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
+        env, name = make(name, hand=load_hand(arguments.hand or None)), NONE
     else:
         env = policy.make_env(hand=hand)
     return Simulation(env, find_policies(env, name), arguments.seed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code, 0."""
-    description = "Show a hand live in the browser."
-    return show(cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description))
-
-
-def show(arguments: ViewArguments) -> int:
-    """Serve the page until Ctrl-C; returns 0.
+    """The command: serves the page until Ctrl-C. Returns its exit code, 0.
 
     Raises:
       DexsimError: it needs JAX, which is missing; see `open_source`.
     """
+    description = "Show a hand live in the browser."
+    arguments = cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description)
     recorded = asset_path("episodes") / f"{arguments.what}.npz"
     if recorded.is_file() and not find_spec("jax"):
         arguments = dataclasses.replace(arguments, what=str(recorded))

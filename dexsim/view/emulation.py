@@ -1,12 +1,13 @@
 """The emulated hand with a policy, in virtual time: true poses, and touch as the bridge measures it."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Frame
+from dexsim.view.scene import Frame
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
@@ -18,7 +19,7 @@ from dexsim_real.wire.serial_hand import check_wire
 
 
 class Emulation:
-    """Trials of a policy (a file, or a shipped one's name) on the emulated hand; each reset is the next one.
+    """Trials of a policy (a file, or a shipped one's name) on the emulated hand, one an episode.
 
     Raises:
       HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.
@@ -42,21 +43,19 @@ class Emulation:
         if not self._controller.spec.turn:
             self._command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5)
 
-    def reset(self) -> Frame:
+    def episode(self) -> Iterator[Frame]:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
-        self._run = VirtualRun(plant, self._controller, self._calibration)
-        self._ticks = self._run.ticking()
-        return self.step()
+        run = VirtualRun(plant, self._controller, self._calibration)
+        ticks = run.ticking()
+        while True:
+            run.policy.command = self._command.value if self._command else 0.5
+            if next(ticks, None) is None:
+                return
+            yield self._frame(run)
 
-    def step(self) -> Frame:
-        self._run.policy.command = self._command.value if self._command else 0.5
-        if next(self._ticks, None) is None:
-            return self.reset()
-        return self._frame()
-
-    def _frame(self) -> Frame:
-        plant, policy, sample = self._run.plant, self._run.policy, self._run.safety.sample
+    def _frame(self, run: VirtualRun) -> Frame:
+        plant, policy, sample = run.plant, run.policy, run.safety.sample
         assert sample is not None, "the policy has ticked"
         joints, position, quat = plant.true_pose()
         parts = plant.shape.parts
@@ -77,7 +76,7 @@ class Emulation:
             finger_force=measured.finger_force,
             goal_rotation=matrix(goals.quat) if goals else None,
             turns=goals.successes if goals else None,
-            seconds=self._run.port.time,
+            seconds=run.port.time,
         )
         command = policy.command if self._command else None
         return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}", command)

@@ -1,5 +1,7 @@
 """Recorded episodes, tick by tick: of an .npz, or the log of a run on a hand as the bridge measured it."""
 
+import operator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,40 +10,30 @@ import numpy as np
 from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import Episodes
 from dexsim.render.snapshot import Snapshot
-from dexsim.view.source import Frame
+from dexsim.view.scene import Frame
 
 
 class Recording:
-    """Episodes one after another; nothing is simulated. A reset goes to the next one, at the time that the page names.
+    """Episodes one after another, from the time on that the page names; nothing is simulated.
 
     Of a log the object's shape is not known: its estimated pose is shown as axes.
     """
 
     def __init__(self, episodes: Episodes):
         self._episodes, self.hand, self.period = episodes.snapshots, episodes.hand, episodes.period
-        self.task, self._kinds, self._number, self._tick = episodes.task, episodes.kinds, -1, 0
+        self.task, self._kinds, self._number = episodes.task, episodes.kinds, -1
 
     def add_controls(self, gui: Any) -> None:
         """The time at which episodes begin."""
         longest = max(len(episode.joint_position) for episode in self._episodes) * self.period
         self._begin = gui.add_slider("go to [s]", min=0.0, max=longest, step=0.01, initial_value=0.0)
 
-    def reset(self) -> Frame:
+    def episode(self) -> Iterator[Frame]:
         self._number = (self._number + 1) % len(self._episodes)
-        seconds = self._episodes[self._number].seconds
-        self._tick = min(int(np.searchsorted(seconds, self._begin.value)), len(seconds) - 1)
-        return self._frame()
-
-    def step(self) -> Frame:
-        self._tick += 1
-        if self._tick == len(self._episodes[self._number].joint_position):
-            return self.reset()
-        return self._frame()
-
-    def _frame(self) -> Frame:
-        snapshot = self._episodes[self._number].map(lambda x: x[self._tick])
-        note = f"recorded episode {self._number + 1} of {len(self._episodes)}"
-        return Frame(snapshot, self._kinds, note)
+        episode = self._episodes[self._number]
+        note, length = f"recorded episode {self._number + 1} of {len(self._episodes)}", len(episode.seconds)
+        for tick in range(min(int(np.searchsorted(episode.seconds, self._begin.value)), length - 1), length):
+            yield Frame(episode.map(operator.itemgetter(tick)), self._kinds, note)
 
 
 def read_log(path: Path, hand: str = "") -> Episodes:

@@ -4,7 +4,7 @@ Geometry is sent once and then moved; a frame costs a few kilobytes.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from dexsim.render.camera import look
 from dexsim.render.panel import force_color
 from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color
 from dexsim.render.render import camera_of
-from dexsim.view.source import Frame
+from dexsim.render.snapshot import Snapshot
 
 _IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing
 _ARROW = (255, 190, 70)
@@ -27,6 +27,18 @@ _AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
 _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
 _ABOVE = 8.0  # deg, lowest elevation of the camera at first
 _FLOOR = 0.2  # m below the point that the camera looks at
+
+
+class Frame(NamedTuple):
+    """One moment; NumPy."""
+
+    snapshot: Snapshot
+    kinds: tuple[str, ...]
+    """Kinds of the object's primitives [K]; empty where the shape is not known."""
+    note: str = ""
+    """What happened, such as "dropped"."""
+    command: float | None = None
+    """The command that the page asks for, to which a force loop adds."""
 
 
 class Scene:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
-from dexsim.view.source import Frame, clicked
+from dexsim.view.scene import Frame
+from dexsim.view.viewer import clicked
 from dexsim_ppo.policy import Policy, load_policy
 
 NONE = "none"
@@ -50,7 +52,7 @@ class Simulation:
         self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies
         self.task = env.name
         self._random = np.random.default_rng(seed)
-        self._key, self._ended = jax.random.key(seed), 0.0
+        self._key = jax.random.key(seed)
         self._shapes = np.asarray(env.pool.object.shape_index)
         # The goal of an evaluation: it does not change or give up by itself.
         _, goals = env.task.evaluation_plan(1, self._shapes)
@@ -58,8 +60,6 @@ class Simulation:
         self._reset = jit(env.reset_from, once=True)
         self._step = jit(self._tick, backend=env.backend)
         self._snapshot = jit(functools.partial(take_snapshot, env), backend=env.backend)
-        self._acting: Any = None  # the policy that the carry is of
-        self._carry: Any = None
         self._state: State
 
     def add_controls(self, gui: Any) -> None:
@@ -74,34 +74,32 @@ class Simulation:
         self._speed = gui.add_slider("push [m/s]", min=0.0, max=2.0, step=0.1, initial_value=_PUSH)
         self._push = gui.add_button("push")
 
-    def reset(self) -> Frame:
+    def episode(self) -> Iterator[Frame]:
         kind = self._kind.value if self._kind else _ANY
         rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
         self._key, key = jax.random.split(self._key)
         row = self._random.choice(rows)
         self._state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
-        object, self._ended, self._acting = self._state.episode.object, 0.0, None
-        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
-        return self._frame()
-
-    def step(self) -> Frame:
-        if self._ended >= _SHOWN:
-            return self.reset()
-        policy = self.policies[self._policy.value]
-        if policy is not self._acting:  # another one, or another episode
-            self._acting, self._carry = policy, policy and policy.initial_carry()
-        action = jnp.zeros(self.env.action_size)
-        if policy is not None:
-            self._carry, action = policy.act(self._carry, self._state.obs["actor"])
-        push = np.zeros(3, np.float32)
-        if clicked(self._push):
-            push = self._random.normal(size=3).astype(np.float32)
-            push *= np.float32(self._speed.value / np.linalg.norm(push))
-        command = np.float32(self._command.value if self._command else 0.0)
-        self._state = self._step(self._state, action, command, np.float32(self._friction.value), push, self._bare)
-        dropped = bool(self._state.terminated) or self._ended > 0
-        self._ended = self._ended + self.period if dropped else 0.0
-        return self._frame("dropped" if dropped else "")
+        object, ended = self._state.episode.object, 0.0
+        bare = object.friction, object.link_friction  # as drawn: the page scales them
+        acting: Policy | None = None
+        carry: Any = None  # of the policy that is acting
+        yield self._frame()
+        while ended < _SHOWN:
+            policy, action = self.policies[self._policy.value], jnp.zeros(self.env.action_size)
+            if policy is not acting:
+                acting, carry = policy, policy and policy.initial_carry()
+            if policy is not None:
+                carry, action = policy.act(carry, self._state.obs["actor"])
+            push = np.zeros(3, np.float32)
+            if clicked(self._push):
+                push = self._random.normal(size=3).astype(np.float32)
+                push *= np.float32(self._speed.value / np.linalg.norm(push))
+            command = np.float32(self._command.value if self._command else 0.0)
+            self._state = self._step(self._state, action, command, np.float32(self._friction.value), push, bare)
+            dropped = bool(self._state.terminated) or ended > 0
+            ended = ended + self.period if dropped else 0.0
+            yield self._frame("dropped" if dropped else "")
 
     def _tick(
         self, state: State, action: jax.Array, command: jax.Array, friction: jax.Array, push: jax.Array, bare: Any

@@ -1,22 +1,53 @@
-"""The page: scene, read-outs and controls, kept in step with a source."""
+"""The page: scene, read-outs and controls, kept in step with a source, which also says what of it can be changed."""
 
 import contextlib
 import dataclasses
 import io
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
 
 import numpy as np
 
 from dexsim.core.errors import DexsimError
+from dexsim.hand.description import Hand
 from dexsim.render.panel import FELT, draw_panel, read_outs
-from dexsim.view.scene import Scene
-from dexsim.view.source import Frame, Source, clicked
+from dexsim.view.scene import Frame, Scene
 
 _PANEL = (300, 560)  # pixels of the taxel maps
 _READ_OUT = 0.2  # s between two updates of text and maps: they cost more than the scene
 _FADE = 3.0  # s, in which the scales of force fall to 1/e
+
+
+class Source(Protocol):
+    """Where frames come from. All calls come from one thread."""
+
+    hand: Hand
+    period: float
+    """Time from one frame to the next, s."""
+    task: str
+    """Of whose preset camera the page opens with (`dexsim.render.render.camera_of`)."""
+
+    def add_controls(self, gui: Any) -> None:
+        """Put what can be changed on the page, before anything else is asked for: `gui` is viser's."""
+        ...
+
+    def episode(self) -> Iterator[Frame]:
+        """The frames of a new episode, to its end."""
+        ...
+
+
+def frames_of(source: Source) -> Iterator[Frame]:
+    """Of one episode after another."""
+    while True:
+        yield from source.episode()
+
+
+def clicked(button: Any) -> bool:
+    """Whether a button of viser was clicked since this was last asked."""
+    was, button.value = button.value, False
+    return was
 
 
 class Viewer:
@@ -58,12 +89,13 @@ class Viewer:
     def run(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Show the source in real time until `stopped`; returns with the server down."""
         try:
-            frame, due = self.source.reset(), time.monotonic()
+            frames, due = frames_of(self.source), time.monotonic()
+            frame = next(frames)
             while not stopped():
-                if clicked(self._reset):
-                    frame = self.source.reset()
-                elif not self.paused.value or clicked(self._step):
-                    frame = self.source.step()
+                if reset := clicked(self._reset):
+                    frames = frames_of(self.source)
+                if reset or not self.paused.value or clicked(self._step):
+                    frame = next(frames)
                 self._show(frame)
                 due = max(due + self.source.period, time.monotonic() - self.source.period)
                 time.sleep(max(due - time.monotonic(), 0.001))

@@ -75,13 +75,9 @@ class BraxEnv(Env):
 
     def restart(self, state: State, done: jax.Array) -> State:
         """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
-        restarted = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
-        return restarted.replace(
-            reward=state.reward,
-            done=state.done,
-            metrics=state.metrics,
-            info={**restarted.info, "time_limit": state.info["time_limit"]},
-        )
+        after = self.env.restart(self._to_dexsim(state), done.astype(bool))
+        info = {**state.info, "key": jax.random.key_data(after.key)}
+        return state.replace(pipeline_state=jax.tree.map(_raw, after), obs=dict(after.obs), info=info)
 
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

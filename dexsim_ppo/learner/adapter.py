@@ -77,7 +77,7 @@ class Adapted:
         self.control_period = float(getattr(env, "control_period", CONTROL_PERIOD))
         # One vector for both networks, scaled by its running statistics.
         layout = (LayoutEntry("observation", int(env.observation_size)),)
-        self.observation_layout = {"actor": layout, "critic": layout}
+        self.observation_layout: dict[str, tuple[LayoutEntry, ...]] = {"actor": layout, "critic": layout}
 
     def reset(self, key: jax.Array) -> AdaptedState:
         """A new episode."""

@@ -18,17 +18,15 @@ from jax.sharding import Mesh
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
 from dexsim.core.layout import layout_size
-from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
-from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
 from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments, value_std
 from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
 from dexsim_ppo.learner.types import Environment, TrainState
-from dexsim_ppo.learner.update import Learner, update
+from dexsim_ppo.learner.update import Learner, init_adam, update
 
 
 class Training(NamedTuple):
@@ -42,21 +40,25 @@ class Training(NamedTuple):
 
 
 def make_train(
-    env: Any, config: PPOConfig, curriculum: CurriculumConfig | None = None, mesh: Mesh | None = None
+    env: Any,
+    config: PPOConfig,
+    curriculum: CurriculumConfig = CurriculumConfig(),  # noqa: B008
+    mesh: Mesh | None = None,
+    start: Callable[[TrainState], TrainState] | None = None,
 ) -> Training:
     """Compiled `init` and `step`.
 
     Args:
       env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
       mesh: devices to spread the environments over (`learner.sharding`); None for one.
+      start: from a fresh learner's state to that which training starts from; None for the same.
     """
     check_float32()
     env = adapt(env)
-    if curriculum is not None and not curriculum.on:
-        curriculum = None
 
     def init(key: jax.Array) -> TrainState:
-        return strong_types(init_state(env, config, key, curriculum, mesh))
+        state = init_state(env, config, key, curriculum, mesh)
+        return strong_types(start(state) if start else state)
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
         iterate = lambda s, _: train_iteration(env, config, s, curriculum, mesh)  # noqa: E731
@@ -85,7 +87,7 @@ def make_train(
 
 
 def init_state(
-    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig | None, mesh: Mesh | None
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: CurriculumConfig, mesh: Mesh | None
 ) -> TrainState:
     """A fresh learner, and freshly reset environments [B, ...] with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
@@ -97,12 +99,12 @@ def init_state(
     critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
     params = init_params(params_key, actor, critic, config.initial_std, memory)
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
-    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    scale = jnp.float32(curriculum.start) if curriculum.on else None
     reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
         average=(params.actor, params.memory),
-        adam=adam.init(params),
+        adam=init_adam(params),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()),
@@ -116,11 +118,7 @@ def init_state(
 
 
 def train_iteration(
-    env: Environment,
-    config: PPOConfig,
-    state: TrainState,
-    curriculum: CurriculumConfig | None = None,
-    mesh: Mesh | None = None,
+    env: Environment, config: PPOConfig, state: TrainState, curriculum: CurriculumConfig, mesh: Mesh | None
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
     key, _, update_key = jax.random.split(state.key, 3)
@@ -128,7 +126,7 @@ def train_iteration(
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
-    batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
+    batch = prepare(config, state, rollout, mesh)
     learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
     learner, update_metrics = update(config, normalizers, batch.samples, update_key, learner, mesh)
     metrics |= update_metrics | {
@@ -139,7 +137,7 @@ def train_iteration(
         "skipped_updates": learner.skipped_updates,
     }
     scale = state.scale
-    if curriculum is not None and scale is not None:
+    if scale is not None:
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
         env_state = jax.vmap(cast(Any, env).set_randomization_scale, (0, None))(env_state, scale)
@@ -197,32 +195,22 @@ class TrainingBatch(NamedTuple):
     explained_variance: jax.Array  # [] share of the returns' variance that the critic's values explain
 
 
-def prepare(
-    config: PPOConfig,
-    value_stats: RunningStats,
-    observation_stats: dict[str, RunningStats],
-    params: Params,
-    rollout: Rollout,
-    mesh: Mesh | None = None,
-) -> TrainingBatch:
+def prepare(config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh | None = None) -> TrainingBatch:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
-    flags = rollout.terminated, rollout.truncated
-    advantage, target = compute_gae(
-        rollout.reward, rollout.value, rollout.next_value, *flags, config.discount, config.gae_lambda
-    )
-    observations = {group: rollout.obs[group] for group in observation_stats}
+    advantage, target = compute_gae(config, rollout)
+    observations = {group: rollout.obs[group] for group in state.observation_stats}
     values = {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}
     means, variances = moments(values, mesh)
     size = advantage.size
     observation_stats = {
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
-        for group, stats in observation_stats.items()
+        for group, stats in state.observation_stats.items()
     }
-    old_mean, old_std = value_stats.mean, value_std(value_stats)
-    value_stats = merge_moments(value_stats, means["target"], variances["target"], size)
+    old_mean, old_std = state.value_stats.mean, value_std(state.value_stats)
+    value_stats = merge_moments(state.value_stats, means["target"], variances["target"], size)
     mean, std = value_stats.mean, value_std(value_stats)
-    critic = rescale_output(params.critic, old_mean, old_std, mean, std)
+    critic = rescale_output(state.params.critic, old_mean, old_std, mean, std)
     samples = Samples(
         obs=rollout.obs,
         decision=rollout.decision,
@@ -238,8 +226,29 @@ def prepare(
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
     samples = in_blocks(samples, blocks, sequences=rollout.carry is not None)
     explained = 1 - variances["error"] / variances["target"]
-    params = dataclasses.replace(params, critic=critic)
+    params = dataclasses.replace(state.params, critic=critic)
     return TrainingBatch(samples, params, value_stats, observation_stats, explained)
+
+
+def compute_gae(config: PPOConfig, rollout: Rollout) -> tuple[jax.Array, jax.Array]:
+    """Advantages and value targets [T, B]: generalised advantage estimation (Schulman et al. 2016).
+
+    Either ending cuts the sum over later steps. A terminated step has no value after it; a truncated one
+    bootstraps from the value of its true final observation.
+    """
+    # `where`, not a product: the value of a diverged final state may be NaN.
+    bootstrap = jnp.where(rollout.terminated, 0.0, rollout.next_value)
+    delta = rollout.reward + config.discount * bootstrap - rollout.value
+    ended = (rollout.terminated | rollout.truncated).astype(rollout.reward.dtype)
+    decay = config.discount * config.gae_lambda * (1.0 - ended)
+
+    def backward(advantage, step):
+        delta_t, decay_t = step
+        advantage = delta_t + decay_t * advantage
+        return advantage, advantage
+
+    _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, decay), reverse=True, unroll=8)
+    return advantage, advantage + rollout.value
 
 
 def strong_types(tree: Any) -> Any:

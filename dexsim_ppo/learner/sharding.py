@@ -26,6 +26,7 @@ from dexsim_ppo.learner.config import PPOConfig
 AXIS = "devices"
 # Parts of the environments, each of which shuffles its own rows: results are the same on all numbers that divide it.
 BLOCKS = 16
+_WHOLE, _SPLIT = PartitionSpec(), PartitionSpec(AXIS)
 Tree = TypeVar("Tree")
 
 
@@ -54,38 +55,36 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
 
 def batched(function: Callable, mesh: Mesh | None) -> Callable:
     """`jax.vmap(function)` whose batch is split over the mesh; arguments and results are [B, ...]."""
-    if mesh is None:
-        return jax.vmap(function)
-    split = PartitionSpec(AXIS)
-    return jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+    return _on_mesh(jax.vmap(function), mesh, _SPLIT, _SPLIT)
 
 
 def averaged(function: Callable, mesh: Mesh | None) -> Callable:
     """`function(shared, split)` on each device's part of `split` [N, ...], its results averaged over the devices."""
-    if mesh is None:
-        return function
-
-    whole, parts = PartitionSpec(), PartitionSpec(AXIS)
-    part = lambda shared, split: _average(function(shared, split))  # noqa: E731
-    return jax.shard_map(part, mesh=mesh, in_specs=(whole, parts), out_specs=whole, check_vma=False)
+    return _on_mesh(lambda *parts: _average(function(*parts), mesh), mesh, (_WHOLE, _SPLIT), _WHOLE)
 
 
 def moments(tree: Any, mesh: Mesh | None) -> tuple[Any, Any]:
     """Mean and variance [...] of each array [T, B, ...] over steps and environments, with two reductions in all."""
 
-    def part(tree: Any, average: Callable = lambda tree: tree) -> tuple[Any, Any]:
-        mean = average(jax.tree.map(lambda x: jnp.mean(x, (0, 1)), tree))
-        return mean, average(jax.tree.map(lambda x, m: jnp.mean((x - align(m, x)) ** 2, (0, 1)), tree, mean))
+    def part(tree: Any) -> tuple[Any, Any]:
+        mean = _average(jax.tree.map(lambda x: jnp.mean(x, (0, 1)), tree), mesh)
+        variance = jax.tree.map(lambda x, m: jnp.mean((x - align(m, x)) ** 2, (0, 1)), tree, mean)
+        return mean, _average(variance, mesh)
 
+    return _on_mesh(part, mesh, PartitionSpec(None, AXIS), _WHOLE)(tree)
+
+
+def _on_mesh(function: Callable, mesh: Mesh | None, inputs: Any, outputs: Any) -> Callable:
+    """`function` on each device's part of its arguments."""
     if mesh is None:
-        return part(tree)
-    whole, parts = PartitionSpec(), PartitionSpec(None, AXIS)
-    each = lambda tree: part(tree, _average)  # noqa: E731
-    return jax.shard_map(each, mesh=mesh, in_specs=parts, out_specs=whole, check_vma=False)(tree)
+        return function
+    return jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
 
 
-def _average(tree: Tree) -> Tree:
+def _average(tree: Tree, mesh: Mesh | None) -> Tree:
     """The mean over the devices, which travels as one array."""
+    if mesh is None:
+        return tree
     flat, restore = ravel_pytree(tree)
     return restore(jax.lax.pmean(flat, AXIS))
 
@@ -111,12 +110,12 @@ def in_blocks(tree: Tree, count: int, sequences: bool) -> Tree:
 
 def copied(tree: Tree, mesh: Mesh | None) -> Tree:
     """The whole `tree` on every device."""
-    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, _WHOLE))
 
 
 def shardings(state: Any, mesh: Mesh) -> Any:
     """The sharding of each array of a `TrainState`: the environments' are split, all others copied."""
-    whole, split = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), PartitionSpec(AXIS)))
+    whole, split = NamedSharding(mesh, _WHOLE), NamedSharding(mesh, _SPLIT)
     return dataclasses.replace(
         jax.tree.map(lambda _: whole, state),
         env_state=jax.tree.map(lambda _: split, state.env_state),
@@ -132,7 +131,7 @@ def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], key: jax.Array) -
 
 
 def place(tree: Tree, like: Any) -> Tree:
-    """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`."""
+    """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`, where these are."""
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
     keys = jax.tree.map(is_key, tree)
     plain = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if is_key(x) else x), tree)

@@ -1,13 +1,12 @@
 """What the learner requires of an environment, and what it carries from one iteration to the next."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import jax
 
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.networks import GRU, MLP, Params
 from dexsim_ppo.learner.running_stats import RunningStats
 
@@ -33,29 +32,18 @@ class Environment(Protocol):
     randomisation ranges in [0, 1].
     """
 
-    @property
-    def name(self) -> str:
-        """The task's name."""
-
-    @property
-    def backend(self) -> str:
-        """The physics backend; "own" for an environment from elsewhere."""
-
-    @property
-    def config(self) -> Any:
-        """The task's configuration."""
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action (A)."""
-
-    @property
-    def observation_layout(self) -> Mapping[str, Sequence[LayoutEntry]]:
-        """Layout of the `"actor"` and `"critic"` observations."""
-
-    @property
-    def control_period(self) -> float:
-        """Length of one control tick, s."""
+    name: str
+    """The task's name."""
+    backend: str
+    """The physics backend; "own" for an environment from elsewhere."""
+    config: Any
+    """The task's configuration."""
+    action_size: int
+    """Length of the action (A)."""
+    observation_layout: dict[str, tuple[LayoutEntry, ...]]
+    """Layout of the `"actor"` and `"critic"` observations."""
+    control_period: float
+    """Length of one control tick, s."""
 
     def reset(self, key: jax.Array) -> Any:
         """A new episode."""
@@ -71,6 +59,15 @@ class Environment(Protocol):
 
     def randomize_episode_time(self, state: Any, key: jax.Array) -> Any:
         """Set the episode clock to a random time, so that a batch does not truncate all at once."""
+
+
+@pytree_dataclass
+class AdamState:
+    """Running moments of the gradient, shaped like the parameters (Adam, Kingma and Ba 2015)."""
+
+    count: jax.Array  # int32 []
+    mean: Params
+    variance: Params
 
 
 @pytree_dataclass

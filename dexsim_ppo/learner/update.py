@@ -1,19 +1,18 @@
-"""The update: epochs over shuffled minibatches, gradient clipping, the adaptive learning rate."""
+"""The update: epochs over shuffled minibatches, gradient clipping, Adam, the adaptive learning rate."""
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dexsim_ppo.learner import adam
-from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Normalizers, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.sharding import averaged
+from dexsim_ppo.learner.types import AdamState
 
 
 class Learner(NamedTuple):
@@ -88,13 +87,13 @@ def pick_rows(samples: Samples, indices: jax.Array) -> Samples:
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
     """Clip the gradients and step. A minibatch whose gradient is not finite is skipped and counted."""
     actor = (grads.actor, grads.log_std, grads.memory)
-    (actor_grads, std_grads, memory_grads), actor_norm = adam.clip_by_global_norm(actor, config.max_grad_norm)
-    critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
+    (actor_grads, std_grads, memory_grads), actor_norm = clip_by_global_norm(actor, config.max_grad_norm)
+    critic_grads, critic_norm = clip_by_global_norm(grads.critic, config.max_grad_norm)
     rate, moves = learner.learning_rate, actor_learns(config, learner)
     if config.critic_first:
         rate = jnp.where(moves, rate, config.learning_rate_max)
     grads = Params(actor_grads, std_grads, critic_grads, memory_grads)
-    params, moments = adam.update(grads, learner.adam, learner.params, rate)
+    params, moments = step_adam(grads, learner.adam, learner.params, rate)
     # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
     params = dataclasses.replace(params, log_std=log_std)
@@ -106,6 +105,37 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
     learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
     skipped = learner.skipped_updates + (1 - ok.astype(jnp.int32))
     return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm}
+
+
+def init_adam(params: Params) -> AdamState:
+    """Zero moments."""
+    return AdamState(
+        count=jnp.zeros((), jnp.int32),
+        mean=jax.tree.map(jnp.zeros_like, params),
+        variance=jax.tree.map(jnp.zeros_like, params),
+    )
+
+
+def step_adam(grads: Params, state: AdamState, params: Params, learning_rate: jax.Array) -> tuple[Params, AdamState]:
+    """One step down the gradient: new parameters and moments. `learning_rate` is []."""
+    b1, b2, epsilon = 0.9, 0.999, 1e-5
+    count = state.count + 1
+    mean = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mean, grads)
+    variance = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g**2, state.variance, grads)
+    time = count.astype(jnp.float32)
+    mean_scale, variance_scale = 1 / (1 - b1**time), 1 / (1 - b2**time)
+
+    def step(p, m, v):
+        return p - learning_rate * (m * mean_scale) / (jnp.sqrt(v * variance_scale) + epsilon)
+
+    return jax.tree.map(step, params, mean, variance), AdamState(count, mean, variance)
+
+
+def clip_by_global_norm(grads: Any, max_norm: float) -> tuple[Any, jax.Array]:
+    """Scale gradients longer than `max_norm` down to it; also return the norm [] before clipping."""
+    norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(grads)))
+    scale = jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
+    return jax.tree.map(lambda g: g * scale, grads), norm
 
 
 def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
+import numpy as np
+
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.hand.description import Hand
@@ -12,6 +14,7 @@ from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
+from dexsim_ppo.learner.networks import carry_size
 from dexsim_ppo.policy import Policy
 
 EnvConfig = TypeVar("EnvConfig")
@@ -124,12 +127,12 @@ def training_config(arguments: TrainArguments) -> Any:
     return env
 
 
-# What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
-_RESUMABLE = {
+# What a resumed run may be given anew: its budget, what looks on, and where the hand's files are. Everything else is
+# part of the saved state.
+_RESUMABLE = (
     *("checkpoint_every", "devices", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "evaluation_share"),
-    *("keep_checkpoints", "log_every", "minutes", "patience", "steps", "video", "wandb"),
-    "hand",  # where its files are: their content must be the same
-}
+    *("hand", "keep_checkpoints", "log_every", "minutes", "patience", "steps", "video", "wandb"),
+)
 
 
 def check_resumed(arguments: TrainArguments, saved: TrainArguments) -> None:
@@ -147,3 +150,43 @@ def printable(arguments: TrainArguments) -> dict[str, Any]:
     """The options as plain data, without the paths of this process."""
     paths = ("run_dir", "resume", "config")
     return {name: value for name, value in to_dict(arguments).items() if name not in paths}
+
+
+# --- fine-tuning --------------------------------------------------------------------------------------
+
+
+def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
+    """`config` with the policy's network and normaliser, little noise, small steps, and the critic alone at first.
+
+    A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
+    policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
+    """
+    units = carry_size(policy.params.memory)
+    normalizer, floor = policy.params.normalizer, config.observation_std_floor
+    running = np.concatenate([np.full(entry.size, entry.scale is None) for entry in policy.observation_layout])
+    smallest = float(np.min(np.asarray(normalizer.std)[running], initial=floor))
+    if smallest < 0.999 * floor:  # Beyond rounding: a higher floor than that of its training would raise deviations.
+        floor = smallest
+    return dataclasses.replace(
+        config,
+        memory="gru" if units else "none",
+        memory_size=units or config.memory_size,
+        actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
+        observation_clip=normalizer.clip,
+        observation_std_floor=floor,
+        learning_rate=1e-5,
+        learning_rate_min=1e-6,
+        learning_rate_max=5e-4,
+        kl_target=2e-4,
+        kl_halving=0,
+        initial_std=0.2,
+        critic_first=100,
+    )
+
+
+def check_network(policy: Policy, config: PPOConfig) -> None:
+    """Raises ConfigError: the policy's network is not that of a learner with this configuration."""
+    network = fine_tuning_config(policy, config)
+    for name in ("memory", "memory_size", "actor_layers"):
+        if getattr(config, name) != getattr(network, name):
+            raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: the policy has {getattr(network, name)}")

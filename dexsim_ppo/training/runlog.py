@@ -1,7 +1,6 @@
 """A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
 
 import contextlib
-import datetime
 import fcntl
 import importlib
 import itertools
@@ -110,27 +109,6 @@ def _free(folder: Path, pattern: str) -> Path:
     return next(path for path in paths if not path.exists())
 
 
-def check_new(path: Path | None) -> None:
-    """Raises ConfigError: the folder given for a new run exists already."""
-    if path and path.exists():
-        raise ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
-
-
-def new_folder(path: Path | None, task: str) -> Path:
-    """A new folder for a run, by default one that is named after its task and the time."""
-    path = path or Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    path.mkdir(parents=True)
-    return path
-
-
-def folder_of(checkpoint: Path) -> Path:
-    """The folder of the run that a checkpoint is of. Raises ConfigError if it lacks what a run needs at the end."""
-    folder = RunFolder(checkpoint.resolve().parent.parent)
-    if not folder.config.exists():
-        raise ConfigError(f"--resume {checkpoint}: {folder.path} has no {folder.config.name}, which a run needs")
-    return folder.path
-
-
 class MetricsLog:
     """Appends one line of JSON per logged iteration; the same goes to TensorBoard, if a writer is installed, and to
     Weights & Biases, if the options name a project."""
@@ -142,13 +120,17 @@ class MetricsLog:
         write_atomic(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
         folder.set_aside(first_iteration)
         self._file = self._closing.enter_context(folder.metrics.open("a", buffering=1))
-        self._tensorboard = _tensorboard_writer(folder.path)
         self._wandb = None
         if arguments.wandb:
             import wandb
 
             config = printable(arguments)
             self._wandb = wandb.init(project=arguments.wandb, name=folder.path.name, dir=folder.path, config=config)
+            self._closing.callback(self._wandb.finish)
+        self._tensorboard = _tensorboard_writer(folder.path)
+        if self._tensorboard:
+            self._closing.enter_context(contextlib.suppress(OSError))  # The disk is full; `metrics.jsonl` says so.
+            self._closing.callback(self._tensorboard.close)
 
     def write(self, row: dict[str, Any]) -> None:
         """Log one iteration: `"iteration"`, `"env_steps"` and any scalars."""
@@ -162,14 +144,7 @@ class MetricsLog:
 
     def close(self) -> None:
         """Flush to disk."""
-        try:
-            self._closing.close()
-        finally:
-            if self._tensorboard:
-                with contextlib.suppress(OSError):  # The disk is full, and `metrics.jsonl` says so.
-                    self._tensorboard.close()
-            if self._wandb:
-                self._wandb.finish()
+        self._closing.close()
 
 
 def _tensorboard_writer(path: Path) -> Any:

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
 
 import dexsim
@@ -21,16 +19,15 @@ from dexsim.core.errors import DexsimError
 from dexsim.hand.source import record_of
 from dexsim.registry import task_option
 from dexsim_ppo import checkpoint
-from dexsim_ppo.evaluate import Evaluator, write_video
+from dexsim_ppo.evaluate import Evaluator, headline, print_report, write_video, written
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.learner.running_stats import recover_stats
 from dexsim_ppo.learner.sharding import place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.report import headline, print_report, written
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
-from dexsim_ppo.training.fine_tune import initialize_from
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, means, policy_of, progress_line, read_metrics
 
 # Selecting the best policy uses starts and episodes that no report has: `evaluate --seed` ends below.
@@ -91,36 +88,23 @@ class Run:
 
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
-        training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh)
+        start = functools.partial(initialize_from, source, self.config) if isinstance(source, Policy) else None
+        training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh, start)
         key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
-        if isinstance(source, checkpoint.Checkpoint):
-            state = self._resume(source, shapes)
+        resumed = self._resume(source, shapes) if isinstance(source, checkpoint.Checkpoint) else None
+        with ThreadPoolExecutor(1) as aside:  # One core compiles and runs `init` while another traces the step.
+            fresh = aside.submit(lambda: resumed or jax.block_until_ready(training.init(key)))
             step = cast(Any, training.step).lower(shapes).compile()
-        else:
-            with ThreadPoolExecutor(1) as aside:  # One core compiles and runs `init` while another traces the step.
-                fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
-                step = cast(Any, training.step).lower(shapes).compile()
-                state = self._initialize(fresh.result(), source)
         self.clock["compile_s"] = time.perf_counter() - begin
-        return state, step
+        return fresh.result(), step
 
     def _resume(self, source: checkpoint.Checkpoint, shapes: TrainState) -> TrainState:
         state, progress = checkpoint.restore(source, shapes), source.content["progress"]
         if self.folder.has_best(int(state.iteration)):
             self.best = progress["best"]
         self.seconds_before, self.without_better = progress["seconds"], progress["without_better"]
-        return place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
-
-    def _initialize(self, state: TrainState, source: Policy | None) -> TrainState:
-        """The fresh state with what the policy to fine-tune has learnt."""
-        if source:
-            fresh, state = state, initialize_from(source, self.config, state)
-            if self.mesh is not None:
-                learned = lambda s: (s.params, s.average, s.observation_stats)  # noqa: E731
-                params, average, stats = place(learned(state), learned(fresh))
-                state = dataclasses.replace(state, params=params, average=average, observation_stats=stats)
-        return state
+        return place(state, shapes)
 
     def _loop(self, state: TrainState, step: Callable, log: MetricsLog | None, stopped: Callable[[], int]) -> None:
         arguments, per_call = self.arguments, self.config.iterations_per_call
@@ -137,7 +121,7 @@ class Run:
             if len(calls_s) == 1:
                 self.clock["first_update_s"] = time.perf_counter() - self.started
                 processes.print_on_first(f"first update {self.clock['first_update_s']:.1f} s after the start")
-            faults.check(metrics, iteration)
+            faults.check(int(metrics["skipped_updates"][-1]), iteration)
             rate = per_call * per_iteration / calls_s[-1]
             row = means(metrics) | {
                 "iteration": iteration,
@@ -223,7 +207,8 @@ class Run:
         self.without_better = 0 if better else self.without_better + 1
         if better:
             self.best = {"return": score, "iteration": iteration}
-            self._write_policy(policy, self.folder.best)
+            if processes.is_first():
+                policy.save(self.folder.best)
         processes.print_on_first(
             f"evaluation at iteration {iteration}: {first} {written(entries[first])}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
@@ -245,14 +230,10 @@ class Run:
                 "progress": {"best": self.best, "seconds": self._seconds(), "without_better": self.without_better},
             },
         )
-        self._write_policy(policy, policy_of(path))
-        self._write_policy(policy, self.folder.last)
         if processes.is_first():
+            policy.save(policy_of(path))
+            policy.save(self.folder.last)
             self.folder.prune(self.arguments.keep_checkpoints)
-
-    def _write_policy(self, policy: Policy, path: Path) -> None:
-        if processes.is_first():
-            policy.save(path)
 
     @property
     def selected(self) -> Path:
@@ -308,27 +289,32 @@ class Faults:
     def __init__(self, config: PPOConfig, folder: RunFolder, state: TrainState):
         self._per_call = config.iterations_per_call * config.epochs * config.minibatches
         self._folder, self._skipped, self._sound = folder, int(state.skipped_updates), int(state.iteration)
-        self._bad_calls, self._faulty = 0, False
+        self._bad_calls = 0
 
-    def check(self, metrics: dict[str, np.ndarray], iteration: int) -> None:
-        """Say when updates begin to be skipped.
-
-        Raises:
-          DexsimError: most updates of several calls in a row were skipped.
-        """
-        skipped, known = int(metrics["skipped_updates"][-1]), self._faulty
+    def check(self, skipped: int, iteration: int) -> None:
+        """Raises DexsimError: most updates of several calls in a row were `skipped`, which counts all of the run's."""
         lost, self._skipped = skipped - self._skipped, skipped
-        self._faulty, self._bad_calls = lost > 0, self._bad_calls + 1 if 2 * lost > self._per_call else 0
+        self._bad_calls = self._bad_calls + 1 if 2 * lost > self._per_call else 0
         if not lost:
             self._sound = iteration
-            return
-        sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
-        before = f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before"
         if self._bad_calls >= DIVERGED_AFTER:
+            sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
             raise DexsimError(
                 f"training diverged: in each of the last {DIVERGED_AFTER} calls most gradients were not finite, the "
-                f"first one after iteration {self._sound}; {before}"
+                f"first one after iteration {self._sound}; "
+                + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
             )
-        if not known:
-            text = f"{lost} of {self._per_call} updates skipped, their gradient is not finite"
-            processes.print_on_first(f"iteration {iteration}: {text}; {before}")
+
+
+def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+    """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
+    normalisation that it was trained with."""
+    with jax.ensure_compile_time_eval():
+        stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    actor, memory = policy.params.layers, policy.params.memory
+    return dataclasses.replace(
+        state,
+        params=dataclasses.replace(state.params, actor=actor, memory=memory),
+        average=(actor, memory),
+        observation_stats=state.observation_stats | {"actor": stats},
+    )

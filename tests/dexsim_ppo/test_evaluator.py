@@ -10,9 +10,8 @@ import pytest
 from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.evaluate import Evaluator
+from dexsim_ppo.evaluate import Evaluator, mean_interval, summarize
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import mean_interval, summarize
 
 
 class Totals(TinyEnv):
@@ -116,5 +115,6 @@ def test_episodes_end_at_their_first_termination():
 def test_a_step_that_diverges_is_counted_although_it_ends_the_episode():
     terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
     metrics = {"return": np.zeros((3, 2)), "non_finite": np.array([[0.0, 0], [1, 0], [1, 0]])}
-    env = SimpleNamespace(summarize=lambda masked, alive: {"non_finite": masked["non_finite"].sum()})
+    sums = lambda masked, alive: {"non_finite": masked["non_finite"].sum()}  # noqa: E731
+    env = SimpleNamespace(evaluation="series", summarize=sums)
     assert summarize(env, metrics, terminated, np.arange(2))["task"]["non_finite"] == 1

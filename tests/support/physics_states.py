@@ -1,28 +1,43 @@
 """States of a scene for tests of an engine, and what C MuJoCo makes of them in double precision."""
 
 import copy
+import types
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from c_scene import force_on
 
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.contact import pairs_with
 from dexsim.physics.interface import PhysicsScene, places
 
 States = dict[str, np.ndarray]
 """By name, float32 [N, size]: qpos, qvel, warmstart, push, targets of the joints, and the fields of the object."""
 
-FIELDS = (
-    "geom_size",
-    "geom_pos",
-    "geom_quat",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "pair_friction",
-    "pair_solref",
-    "pair_solimp",
-)
+
+def scene_of_model(
+    model: mujoco.MjModel, slots: tuple[str, ...], driven: np.ndarray, tips: np.ndarray, tip_geoms: np.ndarray
+) -> PhysicsScene:
+    """The scene of a hand of hinges, of which joints `driven` have motors, and of an object whose body is "object" and
+    whose geoms are "object_0" and on, one for each of the slots."""
+    geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
+    return PhysicsScene(
+        hand=types.SimpleNamespace(num_fingers=len(tips), model_path="hand.xml"),
+        config=PhysicsConfig(),
+        slots=slots,
+        model=model,
+        joint_qpos=driven,
+        joint_dof=driven,
+        object_qpos=np.arange(model.nq - 7, model.nq),
+        object_dof=np.arange(model.nv - 6, model.nv),
+        object_body=model.body("object").id,
+        object_geoms=geoms,
+        object_pairs=pairs_with(model, geoms),
+        tip_bodies=tips,
+        tip_geoms=tip_geoms,
+        tip_growth=np.ones((len(tip_geoms), 3)),
+    )
 
 
 def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -33,18 +48,16 @@ def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) ->
 
 def read_fields(scene: PhysicsScene, model: mujoco.MjModel) -> States:
     """What one world has in place of the scene's constants; one friction for both directions."""
-    where = places(scene)
-    fields = {name: np.array(getattr(model, name)[where[name]]) for name in FIELDS}
+    fields = {name: np.array(getattr(model, name)[where]) for name, where in places(scene).items()}
     return fields | {"pair_friction": fields["pair_friction"][:, 0]}
 
 
 def write_fields(scene: PhysicsScene, model: mujoco.MjModel, states: States, row: int) -> None:
-    """The opposite of `read_fields`."""
-    where = places(scene)
-    for name in FIELDS:
-        here = getattr(model, name)[where[name]]
-        value = states[name][row].astype(float)
-        getattr(model, name)[where[name]] = value[:, None] if name == "pair_friction" else value.reshape(here.shape)
+    """The opposite of `read_fields`, but for the bounds of the broad phase."""
+    for name, where in places(scene).items():
+        if name != "geom_rbound":
+            here, value = getattr(model, name)[where], states[name][row].astype(float)
+            getattr(model, name)[where] = value[:, None] if name == "pair_friction" else value.reshape(here.shape)
     model.body_subtreemass[scene.object_body] = model.body_mass[scene.object_body]
 
 

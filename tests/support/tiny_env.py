@@ -60,6 +60,7 @@ class TinyState:
     truncated: jax.Array
     metrics: dict[str, jax.Array]
     key: jax.Array
+    scale: jax.Array  # of the next episode's start
 
 
 class TinyEnv:
@@ -78,19 +79,22 @@ class TinyEnv:
     def __init__(self, config: TinyConfig | None = None, *, backend: str = "mjx"):
         self.config, self.backend = config or TinyConfig(), "mjx" if backend == "auto" else backend
 
-    def _start(self, key: jax.Array) -> TinyState:
+    def _start(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
         key, subkey = jax.random.split(key)
-        x, target = jax.random.uniform(subkey, (2,), minval=-1.0, maxval=1.0)
-        zero, false = jnp.float32(0), jnp.bool_(False)
-        metrics = {"return": zero, "length": zero, "success": zero, "error": zero}
-        return self._observe(TinyState(x, target, {}, zero, false, false, metrics, key))
+        scale, zero, false = jnp.float32(scale), jnp.float32(0), jnp.bool_(False)
+        x, target = scale * jax.random.uniform(subkey, (2,), minval=-1.0, maxval=1.0)
+        metrics = {"return": zero, "length": zero, "success": zero, "error": zero, "drawn": scale}
+        return self._observe(TinyState(x, target, {}, zero, false, false, metrics, key, scale))
 
     def _observe(self, state: TinyState) -> TinyState:
         obs = jnp.stack([state.x, state.target, jnp.maximum(state.x, 0.0)])
         return dataclasses.replace(state, obs={"actor": obs, "critic": obs})
 
-    def reset(self, key: jax.Array) -> TinyState:
-        return self._start(key)
+    def reset(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
+        return self._start(key, scale)
+
+    def set_randomization_scale(self, state: TinyState, scale: jax.Array) -> TinyState:
+        return dataclasses.replace(state, scale=scale)
 
     def randomize_episode_time(self, state: TinyState, key: jax.Array) -> TinyState:
         clock = jax.random.randint(key, (), 0, self.config.horizon).astype(jnp.float32)
@@ -105,6 +109,7 @@ class TinyEnv:
             "length": length,
             "success": (error < 0.1).astype(jnp.float32),
             "error": error,
+            "drawn": state.metrics["drawn"],
         }
         return self._observe(
             dataclasses.replace(
@@ -118,7 +123,7 @@ class TinyEnv:
         )
 
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
-        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key), state)
+        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key, state.scale), state)
 
     def evaluation_plan(self, count: int, seed: int) -> Plan:
         return Plan(jax.random.split(jax.random.key(seed), count), np.arange(count))
@@ -141,4 +146,4 @@ make_train, make_evaluator = functools.cache(trainer.make_train), functools.cach
 
 def training_of(config: PPOConfig = SMALL, env_class: type[TinyEnv] = TinyEnv) -> Training:
     """The learner on the environment, compiled once for all tests of a process."""
-    return make_train(make_env(env_class, TinyConfig()), config, CurriculumConfig(), None)
+    return make_train(make_env(env_class, TinyConfig()), config, CurriculumConfig(), None, None)

@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.physics.cuda import launch
-from dexsim.physics.cuda.law import PrintedLaw, print_law
-from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
+from dexsim.physics.cuda.program import PrintedLaw, compile_kernel, find_compiler, print_law, source
 from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
-from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, without_gradient
+from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
 from dexsim.physics.law import record
 
 # Newton's method stops at this decrement at least, and its line search at this share of it: forces are then as near to
@@ -32,15 +31,16 @@ class CudaBackend:
         self.scene = scene
         kernel_constants(scene), find_compiler(), launch.architecture()
         self._loaded: dict[PrintedLaw, str] = {}
-        self._tick = without_gradient("cuda", self._call, 1)
 
     def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:
         """One control tick in one launch."""
         joints = len(self.scene.joint_dof)
         recorded = record(law, jnp.zeros(joints))
         name, moving = self._load(print_law(recorded, joints)), (state.qpos, state.qvel, state.warmstart)
-        constant = self._inputs(fields, push)
-        qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *constant, *map(jnp.asarray, recorded.constants))
+        arguments = [*moving, *self._inputs(fields, push), *map(jnp.asarray, recorded.constants)]
+        shapes = [array.shape for array in moving] + [(self.scene.hand.num_fingers, 3), (4,)]
+        results = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+        qpos, qvel, warmstart, force, _ = launch.call(name, results, *arguments)
         return StepResult(PhysicsState(qpos, qvel, warmstart), force)
 
     def _inputs(self, fields: Fields, push: jax.Array) -> list[jax.Array]:
@@ -65,7 +65,3 @@ class CudaBackend:
             )
             self._loaded[law] = launch.load(code, settings, len(buffers(self.scene, law.buffers)))
         return self._loaded[law]
-
-    def _call(self, name: str, *arguments: jax.Array) -> list[jax.Array]:
-        shapes = [array.shape for array in arguments[:3]] + [(self.scene.hand.num_fingers, 3), (4,)]
-        return launch.call(name, [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arguments)

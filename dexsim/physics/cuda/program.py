@@ -1,24 +1,29 @@
-"""The kernel of a scene: its source, and NVRTC, which compiles it.
+"""The kernel of a scene: its source, the motors' recorded law (`dexsim.physics.law`) among it, and NVRTC, its compiler.
 
 NVRTC comes with JAX for CUDA (`nvidia-cuda-nvrtc`) and needs neither nvcc nor CUDA's headers.
 """
 
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import hashlib
 import importlib.util
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_atomic
 from dexsim.core.install import install_line
-from dexsim.physics.cuda.law import PrintedLaw
-from dexsim.physics.cuda.scene import buffers, declare_args, kernel_constants
+from dexsim.physics.cuda.scene import Buffer, buffers, declare_args, kernel_constants
 from dexsim.physics.interface import PhysicsScene
+from dexsim.physics.law import OPERATIONS, Recorded
 
 WORLDS_PER_BLOCK = 8
 """Warps of a block, which pass through the kernel's code in step."""
@@ -28,6 +33,7 @@ SHARED_BYTES = "shared_bytes"
 # Square roots, quotients and sines of fewer instructions: no force differs by more than other roundings make it.
 OPTIONS = ("-std=c++17", "-use_fast_math", "-default-device")
 _KERNEL = Path(__file__).parent / "kernel"
+_CTYPES = {"float32": "float", "int32": "int", "bool": "bool"}
 # The warps of the last block that have no world of their own repeat the last one, and write the same bits again.
 _ENTRY = f"""
 extern "C" __device__ unsigned {SHARED_BYTES} = sizeof(Shared);
@@ -39,6 +45,53 @@ extern "C" __global__ void __launch_bounds__({WORLDS_PER_BLOCK} * 32, 2) {ENTRY}
   tick(args, world, ((Shared *)memory)[warp], lane);
 }}
 """
+
+
+@dataclasses.dataclass(frozen=True)
+class PrintedLaw:
+    """A law as CUDA, and the buffers of its constants."""
+
+    text: str
+    buffers: tuple[Buffer, ...]
+
+
+def print_law(law: Recorded, joints: int) -> PrintedLaw:
+    """`DEV Motor motor_law(const Args &args, int world, int joint, int substep, float position, float velocity)`.
+
+    `Motor` is torque, Nm, and inertia, kg m^2, at a joint angle, rad, and velocity, rad/s (`implicit`). The order of
+    operations is the recorded one; the compiler may fuse a product and a sum, as XLA does.
+
+    Args:
+      law: as recorded.
+      joints: J.
+    """
+    names, buffers = dict[int, str](), []
+    count = len(law.constants)
+    for number, (vector, dtype) in enumerate(law.types[:count]):
+        place = f"[world * {joints} + joint]" if vector else "[world]"
+        names[number] = f"args.law_{number}{place}"
+        buffers.append(Buffer(f"law_{number}", joints if vector else 1, ctype=_CTYPES[dtype]))
+    names |= {count: "substep", count + 1: "position", count + 2: "velocity"}
+    names |= {number: _literal(value, law.types[number][1]) for number, value in law.literals}
+    lines = []
+    for kind, operands, number in law.steps:
+        names[number] = f"v{number}"
+        _, expression = OPERATIONS.get(kind, (None, "{0}"))
+        value = expression.format(*(names[operand] for operand in operands))
+        lines.append(f"  const {_CTYPES[law.types[number][1]]} v{number} = {value};\n")
+    return PrintedLaw(
+        "DEV Motor motor_law(const Args &args, int world, int joint, int substep, float position, float velocity) {\n"
+        f"{''.join(lines)}  return {{{names[law.torque]}, {names[law.inertia]}}};\n}}\n",
+        tuple(buffers),
+    )
+
+
+def _literal(value: Any, dtype: str) -> str:
+    if dtype != "float32":
+        return f"({str(value).lower()})"
+    if math.isfinite(value):
+        return f"({np.float32(value):.8e}f)"
+    return "(0.f / 0.f)" if math.isnan(value) else f"({'-' if value < 0 else ''}1.f / 0.f)"
 
 
 def source(scene: PhysicsScene, law: PrintedLaw) -> str:

@@ -85,7 +85,7 @@ def test_changed_files_are_refused_or_warned_of(own):
 def test_run_keeps_its_hand(own, tmp_path):
     arguments = dataclasses.replace(default_arguments("grasp", "cpu", None), hand=own)
     hand = find_hand(arguments, None)
-    begun = Checkpoint(tmp_path / "run", "train", "grasp", {"hand": record_of(hand)}, {})
+    begun = Checkpoint(tmp_path / "run", "grasp", {"hand": record_of(hand)}, {})
     assert find_hand(arguments, begun).digest == hand.digest
     fine = dataclasses.replace(load_policy("grasp"), hand=record_of(hand))
     assert default_arguments(None, "cpu", fine).hand == own

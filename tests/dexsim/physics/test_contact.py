@@ -11,7 +11,7 @@ from episodes import ground_truth
 from dexsim.objects.config import SHAPES
 from dexsim.objects.params import damping_ratio
 from dexsim.physics import contact
-from dexsim.physics.interface import PhysicsState
+from dexsim.physics.interface import PhysicsState, configured
 from dexsim.touch.skin import Skin
 
 BALL = """
@@ -69,7 +69,8 @@ def test_springs_follow_the_skin(hand, grasp_env):
     @jax.jit
     def configure(target, qpos):
         state = PhysicsState(qpos, jnp.zeros(18), jnp.zeros(18))
-        model = physics.configure(target, ground_truth(grasp_env, target, state, jnp.zeros((5, 3))).tip_stiffness)
+        stiffness = ground_truth(grasp_env, target, state, jnp.zeros((5, 3))).tip_stiffness
+        model = configured(physics.scene, physics.fields(target, stiffness))
         return model["pair_solref"], model["pair_solimp"]
 
     first, second = (

@@ -1,10 +1,8 @@
-"""The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU; the arguments as C++
-has them; each task's kernel through NVRTC, which needs no GPU."""
+"""The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU; each
+task's kernel through NVRTC, which needs no GPU."""
 
-import ctypes
 import dataclasses
 import math
-import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +16,6 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi, physics as engines
 from dexsim.physics.cuda import backend, launch, program
-from dexsim.physics.cuda.scene import Buffer, args_type, declare_args
 from dexsim.physics.physics import Physics
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -98,30 +95,6 @@ def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
     np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=2e-5)
     np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)
     np.testing.assert_allclose(cuda_torque, torque, atol=1e-3)
-
-
-BUFFERS = [
-    Buffer("qpos", 4),
-    Buffer("law_0", 2, ctype="int"),
-    Buffer("law_1", 1, ctype="bool"),
-    Buffer("qpos_out", 4, output=True),
-]
-
-
-def test_the_struct_is_that_of_cpp(tmp_path):
-    names = [buffer.name for buffer in BUFFERS] + [name for name, *_ in args_type(1)._fields_[1:]]
-    offsets = ", ".join(f"offsetof(Args, {name})" for name in names)
-    source = tmp_path / "args.cpp"
-    source.write_text(
-        f"#include <cstddef>\n#include <cstdio>\n{declare_args(BUFFERS)}\n"
-        f'int main() {{ const size_t all[] = {{sizeof(Args), {offsets}}}; for (size_t x : all) printf("%zu ", x); }}'
-    )
-    subprocess.run(["g++", source, "-o", tmp_path / "args"], check=True)
-    size, *there = map(int, subprocess.check_output(tmp_path / "args").split())
-    args = args_type(len(BUFFERS))
-    pointers = [8 * index for index in range(len(BUFFERS))]
-    assert there == pointers + [getattr(args, name).offset for name, *_ in args._fields_[1:]]
-    assert size == ctypes.sizeof(args)
 
 
 @pytest.mark.parametrize("task", ["rotate", "grasp"])

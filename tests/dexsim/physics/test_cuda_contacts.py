@@ -2,15 +2,23 @@
 
 import ctypes
 import functools
-import types
 
 import mujoco
 import numpy as np
 import pytest
 import warp_emulation
+from physics_states import scene_of_model
+from scipy.spatial.transform import Rotation
 
-from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.cuda.scene import MAX_CONTACTS, Buffer, declare_args, find_links, kernel_constants
+from dexsim.physics.cuda.scene import (
+    MAX_CONTACTS,
+    Buffer,
+    args_type,
+    declare_args,
+    find_links,
+    kernel_constants,
+    rotation_matrix,
+)
 from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -63,23 +71,8 @@ def scene_of(slots: tuple[str, ...]) -> PhysicsScene:
         spec.add_pair(geomname1=one, geomname2=two, condim=3)
     model = spec.compile()
     model.geom_rbound[model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE] = 1.0  # their sizes differ between worlds
-    hinges, sized = model.nv - 6, ("tip", "block")
-    return PhysicsScene(
-        hand=types.SimpleNamespace(model_path="hand.xml", num_fingers=1),
-        config=PhysicsConfig(),
-        slots=slots,
-        model=model,
-        joint_qpos=np.arange(hinges),
-        joint_dof=np.arange(hinges),
-        object_qpos=np.arange(hinges, hinges + 7),
-        object_dof=np.arange(hinges, hinges + 6),
-        object_body=model.body("object").id,
-        object_geoms=np.array([model.geom(f"object_{k}").id for k in range(len(slots))]),
-        object_pairs=np.arange(model.npair - len(WITHIN)),
-        tip_bodies=np.array([model.body("tip").id]),
-        tip_geoms=np.array([model.geom(name).id for name in sized]),
-        tip_growth=np.ones((len(sized), 3)),
-    )
+    sized = np.array([model.geom(name).id for name in ("tip", "block")])
+    return scene_of_model(model, slots, np.arange(model.nv - 6), np.array([model.body("tip").id]), sized)
 
 
 def geom_type(kind: str) -> int:
@@ -92,7 +85,7 @@ def in_links(slots: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray
     the object's last."""
     model, links = scene_of(slots).model, find_links(scene_of(slots))
     body, hinges = model.geom_bodyid, links.hinges
-    turn = links.rotation[body] @ np.array([matrix(quat) for quat in model.geom_quat])
+    turn = links.rotation[body] @ np.array([rotation_matrix(quat) for quat in model.geom_quat])
     place = links.place[body] + np.einsum("gij,gj->gi", links.rotation[body], model.geom_pos)
     return np.choose(links.link[body] + 1, [hinges, *range(hinges), hinges + 1]), turn, place
 
@@ -108,16 +101,14 @@ def finder(slots: tuple[str, ...]):
     ]
     text = "\n".join([declare_args(buffers), kernel_constants(scene)])
     library = ctypes.CDLL(str(warp_emulation.build(text, "contacts.cpp")))
-    fields = [*((buffer.name, ctypes.c_void_p) for buffer in buffers), ("n", ctypes.c_int)]
-    arguments = type("Args", (ctypes.Structure,), {"_fields_": [*fields, ("settings", ctypes.c_byte * 64)]})
 
     def find(worlds):
         """Contacts [N, MAX_CONTACTS] of worlds and their numbers [N]."""
         names = ("size", "place", "quat", "links", "object")
         arrays = [np.array([getattr(world, name) for world in worlds], np.float32) for name in names]
-        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
         contacts, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
-        args = arguments(*pointers[:3], len(worlds))
+        args = args_type(3)((ctypes.c_void_p * 3)(*pointers[:3]), len(worlds))
         outputs = (part.ctypes.data_as(ctypes.c_void_p) for part in (contacts, count))
         library.find(ctypes.byref(args), *pointers[3:], *outputs)
         return contacts, count
@@ -136,7 +127,7 @@ class World:
         self.size = rounded(np.array([*(draw_size(kind, random) for kind in scene.slots), *tips]))
         self.quat = random.normal(size=(slots, 4))
         self.quat /= np.linalg.norm(self.quat, axis=1, keepdims=True)
-        self.turn = np.array([matrix(quat) for quat in self.quat])
+        self.turn = np.array([rotation_matrix(quat) for quat in self.quat])
         self.place = np.array([[40.0 * (k + 1), 0, 0] for k in range(slots)])
         self.place[scene.object_geoms == second] = random.normal(size=3) * 0.01
         self.place = rounded(self.place)
@@ -184,8 +175,8 @@ class World:
         if random.uniform() < 0.5:  # almost flat on it, or parallel to it
             # On the rim of a cylinder the place of a contact is no more exact than the tilt.
             least = -3 if model.geom_type[second] == mujoco.mjtGeom.mjGEOM_CYLINDER else -5
-            tilt = turned(random.normal(size=3) * 10.0 ** random.uniform(least, -1))
-            spin = turned([0, 0, random.uniform(0, 2 * np.pi)]) if random.uniform() < 0.7 else np.eye(3)
+            tilt = Rotation.from_rotvec(random.normal(size=3) * 10.0 ** random.uniform(least, -1)).as_matrix()
+            spin = Rotation.from_rotvec([0, 0, random.choice([0, 1, 1]) * random.uniform(0, 2 * np.pi)]).as_matrix()
             turn = tilt @ axes @ spin @ data.geom_xmat[second].reshape(3, 3).T
         way = random.normal(size=3)
         if random.uniform() < 0.5:
@@ -216,22 +207,7 @@ def draw_size(kind: str, random: np.random.Generator) -> np.ndarray:
 
 
 def draw_rotation(random: np.random.Generator) -> np.ndarray:
-    quat = random.normal(size=4)
-    return matrix(quat / np.linalg.norm(quat))
-
-
-def turned(vector) -> np.ndarray:
-    """The rotation by a vector in rad."""
-    quat = np.zeros(4)
-    angle = np.linalg.norm(vector)
-    mujoco.mju_axisAngle2Quat(quat, np.asarray(vector, float) / max(angle, 1e-12), angle)
-    return matrix(quat)
-
-
-def matrix(quat: np.ndarray) -> np.ndarray:
-    elements = np.zeros(9)
-    mujoco.mju_quat2Mat(elements, quat)
-    return elements.reshape(3, 3)
+    return Rotation.from_quat(random.normal(size=4)).as_matrix()
 
 
 def pose(rotation: np.ndarray, place) -> np.ndarray:

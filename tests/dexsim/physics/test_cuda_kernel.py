@@ -1,13 +1,11 @@
 """The kernel of the `cuda` engine in an emulated warp, against C MuJoCo in double precision."""
 
-import types
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 import warp_emulation
-from physics_states import mujoco_substeps, tumble
+from paths import DATA
+from physics_states import mujoco_substeps, scene_of_model, tumble
 from warp_emulation import Emulation
 
 from dexsim.core.errors import AssetError
@@ -19,7 +17,6 @@ from dexsim.physics.model import build_scene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 
-DATA = Path(__file__).parents[2] / "data"
 BOX = ("box",), np.array([[0.03, 0.03, 0.03]])
 ALL = ("box", "capsule", "cylinder"), np.array([[0.03, 0.03, 0.03], [0.025, 0.03, 0], [0.03, 0.03, 0]])
 MESH = ("box", "box"), np.full((2, 3), 0.03)
@@ -84,99 +81,17 @@ def test_example_hands(hand, object, tmp_path, monkeypatch):
     assert np.percentile(error["qpos"], 90) < 2e-6 and np.percentile(error["qvel"], 90) < 2e-4
 
 
-BRANCHED = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <option timestep="0.006" gravity="-9 1 -2" impratio="12" cone="elliptic" integrator="Euler">
-    <flag eulerdamp="disable"/>
-  </option>
-  <default>
-    <joint damping="0.02" armature="0.001" range="-0.2 1.2"/>
-    <geom type="capsule" size="0.009" contype="0" conaffinity="0" density="1500"/>
-  </default>
-  <worldbody>
-    <body name="mount" pos="0.01 -0.01 0.02" euler="0.1 0.2 -0.1">
-      <geom name="mount" type="box" size="0.01 0.03 0.02"/>
-      <body name="wrist" pos="0 0 0.02" euler="0 0.1 0.2">
-        <joint name="wrist" axis="0 1 0.2" pos="0.002 -0.003 0.001" ref="0.1" stiffness="0.3" springref="0.2"/>
-        <geom fromto="0 0 0 0 0 0.03" mass="0.05"/>
-        <body name="palm" pos="0 0 0.03" euler="0.2 0 0">
-          <joint name="sway" axis="1 0.3 0" range="-0.4 0.4" margin="0.05" solreflimit="0.03 0.8"
-            solimplimit="0.8 0.96 0.02 0.4 3"/>
-          <geom name="palm" fromto="0 -0.03 0 0 0.03 0" mass="0.1"/>
-          <body name="rod" pos="0.01 0 0.01" euler="0.3 0.1 0"><geom name="rod" size="0.01 0.01" mass="0.02"/></body>
-          <body name="a1" pos="0.005 0.03 0.01">
-            <joint name="a1" axis="0 1 0"/>
-            <geom name="a1" fromto="0 0 0 0.01 0 0.04" mass="0.02"/>
-            <body name="a2" pos="0.01 0 0.04">
-              <joint name="a2" axis="0.1 1 0" pos="0 0.002 0"/>
-              <geom name="a2" fromto="0 0 0 0.01 0 0.03" mass="0.01"/>
-            </body>
-          </body>
-          <body name="b1" pos="0.005 -0.02 0.01">
-            <joint name="b1" axis="0 1 0.1"/>
-            <geom name="b1" fromto="0 0 0 0.01 0 0.04" mass="0.02"/>
-            <body name="b2" pos="0.01 0 0.04">
-              <joint name="b2" axis="0 1 0"/>
-              <geom name="b2" fromto="0 0 0 0.01 0 0.03" mass="0.01"/>
-            </body>
-          </body>
-        </body>
-      </body>
-      <body name="c1" pos="0.02 0 -0.03">
-        <joint name="c1" axis="0 -1 0"/>
-        <geom name="c1" fromto="0 0 0 0.06 0 0.02" mass="0.03"/>
-      </body>
-    </body>
-    <body name="object" pos="0.1 0 0">
-      <freejoint/>
-      <inertial pos="0.001 0 0" mass="0.1" diaginertia="5e-5 5e-5 5e-5"/>
-      <geom name="object" type="capsule" size="0.02 0.02"/>
-    </body>
-  </worldbody>
-  <equality>
-    <joint joint1="b2" joint2="b1" polycoef="0.05 0.9 0.1 -0.05 0.02" solref="0.015 1" solimp="0.95 0.99 0.003"/>
-    <joint joint1="a2" joint2="b1" polycoef="0 1.1 0 0 0" solref="-400 -30"/>
-  </equality>
-  <contact>
-    <pair geom1="a1" geom2="object" condim="3" solimp="0.7 0.97 0.004 0.3 1.5"/>
-    <pair geom1="a2" geom2="object" condim="3" friction="0.8 0.8" solref="-3000 -40"/>
-    <pair geom1="b1" geom2="object" condim="3"/>
-    <pair geom1="b2" geom2="object" condim="3" solimp="0.9 0.95 0.001 0.5 4"/>
-    <pair geom1="c1" geom2="object" condim="3"/>
-    <pair geom1="rod" geom2="object" condim="3"/>
-    <pair geom1="a2" geom2="b2" condim="3" friction="0.4 0.4"/>
-    <pair geom1="a2" geom2="palm" condim="3"/>
-    <pair geom1="b1" geom2="c1" condim="3"/>
-  </contact>
-</mujoco>
-"""
+BRANCHED = (DATA / "branched.xml").read_text()
 
 
 def branched_scene(text: str = BRANCHED) -> PhysicsScene:
     """A hand that has what ours lack: a wrist that carries fingers, joints away from their bodies' origins, springs,
     margins of limits, couplings across fingers that are no straight lines, contacts between links of one branch."""
     model = mujoco.MjModel.from_xml_string(text)
-    joints = [joint for joint in range(model.njnt) if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE]
-    driven = np.array(joints[::-1][1:])  # in another order than the model's, and not all
-    geom = model.geom("object").id
+    joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     tips = np.array([model.body(name).id for name in ("a2", "b2", "c1")])
-    return PhysicsScene(
-        hand=types.SimpleNamespace(num_fingers=3, model_path="branched.xml"),
-        config=PhysicsConfig(),
-        slots=("capsule",),
-        model=model,
-        joint_qpos=driven,
-        joint_dof=driven,
-        object_qpos=np.arange(model.nq - 7, model.nq),
-        object_dof=np.arange(model.nv - 6, model.nv),
-        object_body=model.body("object").id,
-        object_geoms=np.array([geom]),
-        object_pairs=np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom)),
-        tip_bodies=tips,
-        tip_geoms=np.flatnonzero(np.isin(model.geom_bodyid, tips)),
-        tip_growth=np.zeros((3, 3)),
-    )
+    # Joints in another order than the model's, and not all.
+    return scene_of_model(model, ("capsule",), joints[::-1][1:], tips, np.flatnonzero(np.isin(model.geom_bodyid, tips)))
 
 
 def in_branches(random: np.random.Generator) -> np.ndarray:
@@ -203,7 +118,7 @@ def test_lost_contacts_and_diverged_worlds_have_no_forces():
         + '<geom name="a2"',
     )
     text = text.replace(
-        "</contact>", "".join(f'<pair geom1="{n}" geom2="object" condim="3"/>' for n in names) + "</contact>"
+        "</contact>", "".join(f'<pair geom1="{n}" geom2="object_0" condim="3"/>' for n in names) + "</contact>"
     )
     scene = branched_scene(text)
     states = tumble(scene, 24, in_branches)
@@ -231,17 +146,10 @@ def test_lost_contacts_and_diverged_worlds_have_no_forces():
         ('condim="3"', 'condim="4"', "dimension"),
         ('friction="0.4 0.4"', 'friction="0.4 0.5"', "depends on the direction"),
         ("<equality>", '<equality><weld body1="a1" body2="b1"/>', "equality constraints"),
+        ('<geom name="c1"', '<geom name="c1" type="cylinder"', "no contacts of .*cylinder 'c1' on capsule 'object_0'"),
     ],
 )
 def test_what_does_not_fit_is_named(before, after, message):
     assert BRANCHED.count(before) >= 1
-    with pytest.raises(AssetError, match=message):
-        cuda_scene.check_scene(branched_scene(BRANCHED.replace(before, after, 1)))
-
-
-def test_kinds_without_contacts_are_named():
-    text = BRANCHED.replace('<geom name="c1"', '<geom name="c1" type="cylinder"')
-    with pytest.raises(
-        AssetError, match="branched.xml: backend cuda has no contacts of .*cylinder 'c1' on capsule 'object'"
-    ):
-        cuda_scene.kernel_constants(branched_scene(text))
+    with pytest.raises(AssetError, match=f"hand.xml: backend cuda .*{message}"):
+        cuda_scene.kernel_constants(branched_scene(BRANCHED.replace(before, after, 1)))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from paths import DATA
 from two_fingers import write
 
 from dexsim.core.compilation import jit
@@ -19,38 +20,6 @@ from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
-
-# Two fingers that pinch a capsule. One finger has a coupled joint, the other dry friction and a limit that presses.
-MJCF = """
-<mujoco>
-  <compiler angle="radian"/>
-  <default>
-    <joint type="hinge" damping="0.01" armature="0.0005" actuatorfrcrange="-.5 .5"/>
-    <geom contype="0" conaffinity="0"/>
-    <default class="tip"><geom type="sphere" size=".01" mass=".01" contype="1" conaffinity="1"/></default>
-  </default>
-  <worldbody>
-    <body name="base"><geom name="base" type="box" size=".02 .04 .005" mass=".2"/>
-      <body name="a1" pos="0 .0326 0">
-        <joint name="a" axis="1 0 0" range="-0.5 1.2"/>
-        <geom type="capsule" fromto="0 0 0 0 0 .02" size=".005" mass=".02"/>
-        <body name="a2" pos="0 0 .025">
-          <joint name="a_next" axis="1 0 0" range="-1 2"/>
-          <geom name="a2" class="tip" pos="0 0 .025"/>
-          <site name="a_tip" pos="0 0 .025"/>
-        </body>
-      </body>
-      <body name="b1" pos="0 -.0326 0">
-        <joint name="b" axis="-1 0 0" range="0.01 1.2" frictionloss="0.003"/>
-        <geom name="b1" class="tip" pos="0 0 .05"/>
-        <site name="b_tip" pos="0 0 .05"/>
-      </body>
-    </body>
-  </worldbody>
-  <equality><joint name="couple" joint1="a_next" joint2="a" polycoef="0 0.7 0 0 0"/></equality>
-</mujoco>
-"""
-
 
 SIZE = np.float32([[0.02, 0.03, 0]])
 POSE = jnp.array([0.003, 0.002, 0.008, 0, 0, 0.05, 1, 0, 0, 0])  # joint b is beyond its limit
@@ -73,8 +42,9 @@ WEIGHT = jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32)
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory):
+    """Two fingers around a capsule."""
     layout = "a,0,0,0,-.01,.025,0,-1,0,1e-5\nb,0,0,0,.01,.05,0,1,0,1e-5\n"
-    return load_hand(write(tmp_path_factory.mktemp("two"), MJCF, layout))
+    return load_hand(write(tmp_path_factory.mktemp("two"), (DATA / "pinch.xml").read_text(), layout))
 
 
 def outcome_on(hand, backend):

@@ -1,23 +1,22 @@
 """The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
 
 import dataclasses
+import operator
 import os
 import subprocess
 import sys
 import warnings
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 
-import dexsim.env.evaluation  # noqa: F401  a snapshot is a pytree from here on
+from dexsim.core.assets import asset_path
+from dexsim.datasets.episodes import read_episodes
 from dexsim.geometry import sdf
-from dexsim.hand.load import load_hand
 from dexsim.render import picture, render
 from dexsim.render.camera import Camera, look
 from dexsim.render.picture import Primitives, cast
-from dexsim.render.snapshot import Snapshot
 
 KINDS = ("sphere", "box", "cylinder", "capsule")
 SIZES = {
@@ -42,27 +41,18 @@ def turned(seed):
 
 
 @pytest.fixture(scope="module")
-def hand():
-    return load_hand()
+def recorded():
+    """Episodes of a grasp, as the live view shows them."""
+    return read_episodes(asset_path("episodes") / "grasp.npz")
 
 
-def snapshot(hand, *, active="sphere", force=None):
-    """A loosely closed hand over an object in front of the palm; touch only where `force` [F, N] says so."""
-    count = len(KINDS)
-    force = np.zeros(hand.taxel_position.shape[:2], np.float32) if force is None else force
-    return Snapshot(
-        joint_position=np.float32([1.4, 0.2, 0.3, 0.0] + [0.8, 0.5] * 4),
-        object_position=np.float32([0.055, 0.0, 0.12]),
-        object_rotation=np.eye(3, dtype=np.float32),
-        primitive_size=np.float32([SIZES[kind] for kind in KINDS]),
-        primitive_position=np.zeros((count, 3), np.float32),
-        primitive_rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-        primitive_active=np.array([kind == active for kind in KINDS]),
-        taxel_force=force,
-        command=np.float32([0.5]),
-        target_force=np.float32(3.0),
-        finger_force=force.sum(1),
-    )
+@pytest.fixture(scope="module")
+def loose(recorded):
+    """A loosely closed hand that feels nothing, over no object."""
+    first = recorded.snapshots[0].map(operator.itemgetter(0))
+    joints = np.float32([1.4, 0.2, 0.3, 0.0] + [0.8, 0.5] * 4)
+    nothing = {name: np.zeros_like(getattr(first, name)) for name in ("primitive_active", "taxel_force")}
+    return dataclasses.replace(first, joint_position=joints, **nothing)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -86,18 +76,19 @@ def test_rays_hit_the_surface_with_outward_normals(kind):
     np.testing.assert_allclose(depth, surface.depth[seen], rtol=1e-6)
 
 
-def test_a_loaded_taxel_shows_on_the_finger(hand):
+def test_a_loaded_taxel_shows_on_the_finger(hand, recorded, loose):
     """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
-    cold = snapshot(hand, active=None)
-    pose = render.hand_poses(hand, cold.joint_position[None])[0]
+    pose = render.hand_poses(hand, loose.joint_position[None])[0]
     size = (640, 480)
     view = look(render.CAMERAS["grasp"], (400, 480))
     facing = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1)
     finger, taxel = np.unravel_index(np.argmax(np.where(np.arange(5)[:, None] == 0, facing, -1)), facing.shape)
-    force = np.zeros_like(cold.taxel_force)
+    force = np.zeros_like(loose.taxel_force)
     force[finger, taxel] = 2.0
-    hot = snapshot(hand, active=None, force=force)
-    frames = [render.render_frame(hand, KINDS, s, size=size, force_range=2.0)[:, :400].astype(int) for s in (cold, hot)]
+    frames = [
+        render.render_frame(hand, recorded.kinds, s, size=size, force_range=2.0)[:, :400].astype(int)
+        for s in (loose, dataclasses.replace(loose, taxel_force=force))
+    ]
     rows, columns = np.nonzero(np.any(frames[0] != frames[1], -1))
     assert 3 <= len(rows) < 200
     pixel, _ = view.project(pose.taxel_position[finger, taxel])
@@ -112,32 +103,29 @@ def quarter(axis):
 
 
 def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
-    without = snapshot(hand, active="box")
+    recorded = read_episodes(asset_path("episodes") / "rotate.npz")
+    first = recorded.snapshots[0].map(operator.itemgetter(0))
     view = look(render.CAMERAS["rotate"], (200, 240))
     x, y = view.project(picture.goal_position(render.CAMERAS["rotate"]))[0].astype(int)
     frames = [
-        render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate")[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1))
-        for s in (without, *(dataclasses.replace(without, goal_rotation=turn) for turn in (np.eye(3), quarter(0))))
+        render.render_frame(
+            hand, recorded.kinds, dataclasses.replace(first, goal_rotation=turn), size=SMALL, camera="rotate"
+        )
+        for turn in (None, np.eye(3), quarter(0))
     ]
+    frames = [frame[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1)) for frame in frames]
     assert np.ptp(frames[0]) < 20, "the backdrop is grey"
     assert np.abs(frames[1] - frames[0]).max() > 60 and np.abs(frames[2] - frames[1]).max() > 60
 
 
-def episode(hand, length):
-    force = np.zeros(hand.taxel_position.shape[:2], np.float32)
-    force[1, 30:60] = 0.2
-    steps = []
-    for t in range(length):
-        step = snapshot(hand, force=force * t)
-        steps.append(jax.tree.map(np.asarray, step))
-        steps[-1].object_position[0] += 0.002 * t
-    env = SimpleNamespace(name="grasp", hand=hand, primitive_kinds=KINDS)
-    return env, jax.tree.map(lambda *x: np.stack(x), *steps)
+def episode(recorded, length):
+    env = SimpleNamespace(name="grasp", hand=recorded.hand, primitive_kinds=recorded.kinds)
+    return env, recorded.snapshots[0].map(operator.itemgetter(slice(length)))
 
 
-def test_mp4_is_written_and_readable(hand, tmp_path):
+def test_mp4_is_written_and_readable(recorded, tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    env, steps = episode(hand, 5)
+    env, steps = episode(recorded, 5)
     path = render.render_episode(env, steps, tmp_path / "video.mp4", fps=25, size=SMALL)
     assert path.suffix == ".mp4"
     with warnings.catch_warnings():
@@ -148,15 +136,17 @@ def test_mp4_is_written_and_readable(hand, tmp_path):
     assert frames == 5 and abs(seconds - 0.2) < 0.05
     first = np.frombuffer(next(reader), np.uint8).reshape(240, 320, 3).astype(int)
     reader.close()
-    drawn = render.render_frame(hand, KINDS, jax.tree.map(lambda x: x[0], steps), size=SMALL, force_range=1.0)
+    drawn = render.render_frame(
+        env.hand, recorded.kinds, steps.map(operator.itemgetter(0)), size=SMALL, force_range=1.0
+    )
     assert np.abs(first[:, :200] - drawn[:, :200]).mean() < 4  # what lossy compression leaves
 
 
-def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
+def test_a_film_of_another_rate_keeps_its_duration(recorded, tmp_path, monkeypatch):
     from PIL import Image
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if not installed
-    env, steps = episode(hand, 9)
+    env, steps = episode(recorded, 9)
     for rate, frames, duration in ((10, 3, 100), (60, 18, 20)):
         path = render.render_episode(env, steps, tmp_path / "new" / "video.mp4", fps=30, size=(160, 120), rate=rate)
         assert path == tmp_path / "new" / "video.gif"
@@ -164,7 +154,7 @@ def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
             assert image.n_frames <= frames and image.info["duration"] >= duration - 4
             total = sum(image.seek(k) or image.info["duration"] for k in range(image.n_frames))
         assert total == pytest.approx(300, abs=30 + 60 * (rate == 60))  # a GIF counts hundredths, and merges twins
-    empty = jax.tree.map(lambda x: x[:0], steps)
+    empty = steps.map(operator.itemgetter(slice(0)))
     with pytest.raises(ValueError, match="no snapshots"):
         render.render_episode(env, empty, tmp_path / "none.gif", fps=30)
 
@@ -189,10 +179,10 @@ assert not bad, bad
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env=environment)
 
 
-def test_a_film_that_fails_leaves_the_one_before_it(hand, tmp_path, monkeypatch):
+def test_a_film_that_fails_leaves_the_one_before_it(recorded, tmp_path, monkeypatch):
     ffmpeg, path = pytest.importorskip("imageio_ffmpeg"), tmp_path / "video.mp4"
     path.write_text("the one before it")
-    env, steps = episode(hand, 3)
+    env, steps = episode(recorded, 3)
     monkeypatch.setattr(ffmpeg, "write_frames", truncated)
     with pytest.raises(OSError) as error:
         render.render_episode(env, steps, path, fps=20, size=(160, 120))

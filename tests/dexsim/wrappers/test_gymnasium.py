@@ -101,12 +101,18 @@ def test_a_batch_is_drawn_as_one_picture_each(grasp_env):
     np.testing.assert_array_equal(single.render(), first)
 
 
-def test_a_learner_in_the_manner_of_cleanrl_learns_through_gymnasiums_wrappers():
-    pytest.importorskip("flax")
-    from cleanrl_ppo import train
+def test_gymnasiums_wrappers_normalise_and_count_episodes():
+    from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward, RecordEpisodeStatistics
 
-    returns = train(GymVectorEnv(TinyEnv(), 32, **NEXT_STEP), iterations=25)
-    assert returns[:64].mean() < 20 < 28 < returns[-64:].mean(), "of 31.2 at best"
+    env = RecordEpisodeStatistics(GymVectorEnv(TinyEnv(TinyConfig(horizon=6)), 8, **NEXT_STEP))
+    env, lengths, seen = NormalizeReward(NormalizeObservation(env)), [], []
+    env.reset(seed=0)
+    for _ in range(70):
+        observation, _, _, _, info = env.step(env.action_space.sample())
+        lengths += info["episode"]["l"][info["_episode"]].tolist() if "episode" in info else []
+        seen.append(observation)
+    assert lengths == [6] * 80, "seven steps an episode, one of which restarts"
+    assert np.abs(np.mean(seen, (0, 1))).max() < 0.5 and 0.5 < np.std(seen, (0, 1)).min()
 
 
 def test_a_mode_without_restarts_is_an_error():

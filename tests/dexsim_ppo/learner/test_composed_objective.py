@@ -108,7 +108,7 @@ def experience(script, config, params, stats, value_stats, key):
         )
         normalizers = ppo.make_normalizers(script, config, stats)
         _, rollout, _ = ppo.collect_rollout(script, config, state)
-        samples, start, *_ = ppo.prepare(config, value_stats, {}, params, rollout)
+        samples, start, *_ = ppo.prepare(config, state, rollout)
         moved = jax.tree.map(jnp.add, start, step)
         objective = lambda p: loss(p, config, normalizers, samples, params.log_std)  # noqa: E731
         (value, metrics), grads = jax.value_and_grad(objective, has_aux=True)(moved)

@@ -13,7 +13,6 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import actor_mean
-from dexsim_ppo.learner.networks import GRU, Layer, step_memory
 from dexsim_ppo.policy import Policy
 
 MAX_STEPS = 6
@@ -72,7 +71,7 @@ def experience(kind):
     @jax.jit
     def collect(state):
         after, rollout, _ = ppo.collect_rollout(env, config, state)
-        samples, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
+        samples, *_ = ppo.prepare(config, state, rollout)
         return after, rollout, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # blocks one after another
 
     return jax.device_get(collect(state))
@@ -99,25 +98,6 @@ def test_every_episode_begins_with_an_empty_memory_and_only_then():
     assert 0 < ended.sum() < ended.size and ended[:-1].any(), "episodes that end within the rollout"
     assert not later[ended].any()
     assert np.abs(later[~ended]).max(-1).min() > 0
-
-
-def test_a_gated_recurrent_unit_is_that_of_its_equations():
-    """Unit by unit, in double precision."""
-    rng, n, units = np.random.default_rng(0), 3, 4
-    w, u = rng.normal(size=(n, 3 * units)), rng.normal(size=(units, 3 * units))
-    b, c = rng.normal(size=(2, 3 * units))
-    x, h = rng.normal(size=n), rng.normal(size=units)
-    unit = GRU(*(Layer(jnp.float32(kernel), jnp.float32(bias)) for kernel, bias in ((w, b), (u, c))))
-    wanted = []
-    for i in range(units):
-        given, past = (
-            [m[:, i + k * units] @ v + d[i + k * units] for k in range(3)] for m, v, d in ((w, x, b), (u, h, c))
-        )
-        reset, update = (1 / (1 + np.exp(-given[k] - past[k])) for k in (0, 1))
-        wanted.append(update * h[i] + (1 - update) * np.tanh(given[2] + reset * past[2]))
-    state, seen = step_memory(unit, jnp.float32(h), jnp.float32(x))
-    np.testing.assert_allclose(state, wanted, atol=1e-6)
-    np.testing.assert_array_equal(seen, np.append(np.float32(x), state))
 
 
 def test_gradients_go_back_through_the_rollout():

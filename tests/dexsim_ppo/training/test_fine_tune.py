@@ -1,6 +1,7 @@
 """Fine-tuning a policy: what is kept, what trains first, and what is refused."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,12 @@ from test_train import QUICK, exit_code
 from tiny_env import SMALL, TinyEnv, training_of
 
 from dexsim_ppo import train
+from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
+from dexsim_ppo.training.arguments import fine_tuning_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
+from dexsim_ppo.training.trainer import initialize_from
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +34,8 @@ def tiny_task(monkeypatch):
 
 
 def started(policy, config):
-    training = training_of(config)
-    return training, initialize_from(policy, config, training.init(jax.random.key(1)))
+    training = make_train(TinyEnv(), config, start=functools.partial(initialize_from, policy, config))
+    return training, training.init(jax.random.key(1))
 
 
 def test_it_sees_as_the_policy_saw(policy):

@@ -1,7 +1,9 @@
-"""Where metrics go, and which files of a run stay."""
+"""Where metrics go, which files of a run stay, and what evaluations during training choose."""
 
+import dataclasses
 import json
 import sys
+import time
 from types import SimpleNamespace
 
 import jax
@@ -10,9 +12,10 @@ from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.errors import CheckpointError
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training import runlog
+from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_metrics
+from dexsim_ppo.training.trainer import Run
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -69,3 +72,45 @@ def test_a_resumed_log_goes_on_after_the_checkpoint_and_to_every_sink(tmp_path, 
     begun, *logged = said
     assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
     assert logged == [("kl", 0.5, 800), ({"kl": 0.5}, 800), "closed", "finished"], "over environment steps, and no NaN"
+
+
+# --- evaluations during training: which policy they choose, and when they end a run ------------------------
+
+ARGUMENTS = TrainArguments(
+    env=TinyConfig(), ppo=SMALL, task="tiny", evaluate_every=2, evaluation_chunk=10, patience=2, evaluation_share=0.1
+)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A run at 100 s; `run.evaluate(return, ...)` evaluates one policy after another, and gives the numbers of those
+    that were saved as the best."""
+    monkeypatch.setattr(time, "perf_counter", lambda: 100.0)
+    run, saved = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0), []
+
+    def evaluate(*returns, takes=1.0):
+        for number, value in enumerate(returns):
+            report = {"return": {"value": value}, "held": {"value": 1.0}, "task": {}, "seconds": takes}
+            run.evaluator = lambda *_, report=report, **given: (report, given["seed"] == trainer.SELECTION_SEED)
+            policy = SimpleNamespace(params=None, save=lambda path, number=number: saved.append((number, path)))
+            monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
+            run._evaluate(None, number)
+        assert all(path == run.folder.best for _, path in saved)
+        return [number for number, _ in saved]
+
+    run.evaluate = evaluate
+    return run
+
+
+def test_the_best_policy_is_the_one_with_the_highest_return(run):
+    assert run.evaluate(float("nan"), 3.0, float("nan"), 2.0, 4.0, 4.0) == [0, 1, 4]
+    assert run.best == {"return": 4.0, "iteration": 4}
+
+
+def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run):
+    run.evaluate(3.0, 2.0, 4.0, 1.0)
+    assert not run._is_over(8)
+    run.evaluate(4.0)
+    assert run._is_over(8)
+    run.arguments = dataclasses.replace(ARGUMENTS, patience=0)
+    assert not run._is_over(8)

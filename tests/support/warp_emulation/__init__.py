@@ -40,10 +40,7 @@ class Emulation:
         text = "\n".join([declare_args(self.buffers), cuda_scene.kernel_constants(scene), law])
         library = ctypes.CDLL(str(build(text)))
         self._run = library.run
-        scalars = [(name, ctypes.c_int) for name in ("n", "substeps", "iterations", "line_search")]
-        scalars += [(name, ctypes.c_float) for name in ("tolerance", "line_search_tolerance")]
-        fields = [(b.name, ctypes.c_void_p) for b in self.buffers] + scalars
-        self._arguments = type("Args", (ctypes.Structure,), {"_fields_": fields})
+        self._arguments = cuda_scene.args_type(len(self.buffers))
 
     def run(
         self,
@@ -66,8 +63,8 @@ class Emulation:
                 value = np.asarray(inputs[buffer.name], dtype).reshape(n, -1)
                 assert value.shape[1] == buffer.size, f"{buffer.name}: expected {buffer.size}, got {value.shape[1]}"
                 arrays[buffer.name] = np.ascontiguousarray(value)
-        pointers = [array.ctypes.data for array in arrays.values()]
-        arguments = self._arguments(*pointers, n, substeps, iterations, line_search, tolerance, line_search_tolerance)
+        pointers = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays.values()))
+        arguments = self._arguments(pointers, n, substeps, iterations, line_search, tolerance, line_search_tolerance)
         self._run(ctypes.byref(arguments))
         return {buffer.name: arrays[buffer.name] for buffer in self.buffers if buffer.output}
 
