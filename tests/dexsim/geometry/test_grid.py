@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.interpolate import RegularGridInterpolator
 from shapes import bake, bounds, solid
 
 from dexsim.core.errors import AssetError
 from dexsim.geometry import grid, mesh, sdf
 
-trimesh = pytest.importorskip("trimesh")
 BOX = np.array([0.025, 0.02, 0.03])
 COARSE = 24  # nodes
 signed_distance = jax.jit(grid.signed_distance)
@@ -69,8 +69,10 @@ def bad_meshes():
     nan, mixed = vertices.copy(), faces.copy()
     nan[3, 1] = np.nan
     mixed[4] = mixed[4][::-1]
+    touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
     return {
         "open": (vertices, faces[:-1]),
+        "non-manifold: 1 edges have more than two": touching,
         "inward": turned(box.copy()),
         "both ways": (vertices, mixed),
         "no volume": flat(box.copy()),
@@ -86,13 +88,6 @@ def bad_meshes():
 def test_a_bad_mesh_is_an_error(word):
     with pytest.raises(AssetError, match=word):
         mesh.load_mesh(bad_meshes()[word])
-
-
-def test_an_edge_of_four_triangles_is_named():
-    box = trimesh.creation.box(2 * BOX)
-    touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
-    with pytest.raises(AssetError, match="non-manifold: 1 edges have more than two"):
-        mesh.load_mesh(touching)
 
 
 @pytest.mark.parametrize("repair", ["shell", "hull"])
