@@ -1,6 +1,7 @@
 """Which objects are drawn, and from which ranges."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
@@ -23,11 +24,7 @@ KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
-PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
-RANGES = (*SIZE_RANGES, *PROPERTY_RANGES)
-"""Fields of `ObjectConfig` that are drawn for every object."""
-MESH_RANGES = ("mesh_size", *PROPERTY_RANGES)
-"""Those of a mesh."""
+PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
 SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -96,7 +93,7 @@ class ObjectConfig(Config):
     @property
     def ranges(self) -> tuple[str, ...]:
         """Fields that are drawn for every object."""
-        return MESH_RANGES if self.mesh else RANGES
+        return (*(("mesh_size",) if self.mesh else SIZE_RANGES), *PROPERTY_RANGES)
 
     @property
     def slots(self) -> tuple[str, ...]:
@@ -128,9 +125,7 @@ def load_mesh_object(config: ObjectConfig) -> MeshObject:
     Raises:
       AssetError: see `dexsim.objects.mesh.load`.
     """
-    return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts, repair=config.mesh_repair)
-
-
-def nominal(config: ObjectConfig, name: str) -> float:
-    """The nominal value of a range of `ObjectConfig`."""
-    return 1.0 if name == "inertia_scale" else sum(getattr(config, name)) / 2
+    file = Path(config.mesh).expanduser()
+    changed = file.stat().st_mtime_ns if file.is_file() else 0
+    unit, parts, repair = config.mesh_unit, config.mesh_parts, config.mesh_repair
+    return load(str(file), unit=unit, parts=parts, repair=repair, changed=changed)

@@ -178,10 +178,8 @@ class Grasp(Task):
         matrix = rotations.quat_to_matrix(quat)
         # How far the object reaches [6] along the palm's axes, in both directions. Its middle, not its origin, is put
         # where the fingers meet: that of a composition is in its body, beside which the neck juts out.
-        parts = object.size, object.position, object.active
-        reach = jax.vmap(lambda way: extent(*parts, rotations.rotate_inverse(matrix, way), object.kinds, object.quat))(
-            jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
-        )
+        ways = jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
+        reach = jax.vmap(lambda way: extent(object, rotations.rotate_inverse(matrix, way)))(ways)
         middle = (reach[1:3] - reach[4:]) / 2
         position = jnp.stack([palm_height(hand) + gap + reach[3], *(jnp.asarray(reference[1:]) + shift - middle)])
         qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])

@@ -23,7 +23,7 @@ from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
-from dexsim.objects.config import KINDS, MESH_RANGES, PROPERTY_RANGES
+from dexsim.objects.config import KINDS, PROPERTY_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
@@ -125,8 +125,8 @@ class Rotate(Task):
         self._placed = placed = config.placed_on(hand)
         self.turn = placed.turn
         self.slots, self.largest = slots(config), largest_size(config)
-        drawn = ("edge", "proportions", *(f"objects.{name}" for name in PROPERTY_RANGES))
-        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.objects.mesh else drawn
+        sizes = ("objects.mesh_size",) if config.objects.mesh else ("edge", "proportions")
+        self.object_ranges = (*sizes, *(f"objects.{name}" for name in PROPERTY_RANGES))
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
