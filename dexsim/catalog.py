@@ -4,15 +4,14 @@ from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
-from dexsim.hand.load import DEFAULT
+from dexsim.hand.load import DEFAULT, shipped_hands
 from dexsim.registry import TASKS
 
 
 def catalog() -> dict[str, list[str]]:
     """Names of tasks, hands and shipped policies."""
-    hands = [path.stem for path in asset_path("hand").rglob("*.toml")]
     policies = [path.stem for path in asset_path("policies").glob("*.msgpack")]
-    return {"tasks": sorted(TASKS), "hands": sorted(hands), "policies": sorted(policies)}
+    return {"tasks": sorted(TASKS), "hands": sorted(shipped_hands()), "policies": sorted(policies)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
