@@ -24,7 +24,7 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
 from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics
+from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, open_hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import hand_poses
 from dexsim.tasks.grasp.config import GraspConfig
@@ -60,10 +60,9 @@ def check_kinematics(hand: Hand) -> str:
 
 def check_fingertips(hand: Hand) -> str:
     """Every fingertip has a primitive that touches the object; a mesh does not count."""
-    for name, body in zip(hand.finger_names, hand.tip_body, strict=True):
-        if not any(geom.touches and geom.body == body for geom in hand.geoms):
-            return f"finger {name!r} has no primitive at its tip that touches (no mesh)"
-    return ""
+    touching = {geom.body for geom in hand.geoms if geom.touches}
+    bare = [name for name, body in zip(hand.finger_names, hand.tip_body, strict=True) if body not in touching]
+    return f"finger {bare[0]!r} has no primitive at its tip that touches (no mesh)" if bare else ""
 
 
 def check_taxels(hand: Hand) -> str:
@@ -94,14 +93,14 @@ def check_taxels(hand: Hand) -> str:
 def check_frame(hand: Hand) -> str:
     """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of
     -y."""
-    pose = forward_kinematics(hand, _open(hand))
+    pose = forward_kinematics(hand, open_hand(hand))
     tips, bodies = np.asarray(pose.tip_position), np.asarray(pose.body_position)
     roots = np.array([bodies[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
-    for name, arm in list(zip(hand.finger_names, tips - roots, strict=True))[1:]:
-        if arm[2] < _UPRIGHT * np.linalg.norm(arm):
-            way = ", ".join(f"{x:.2f}" for x in arm / np.linalg.norm(arm))
+    ways = (tips - roots) / np.linalg.norm(tips - roots, axis=1, keepdims=True)
+    for name, way in list(zip(hand.finger_names, ways, strict=True))[1:]:
+        if way[2] < _UPRIGHT:
             return (
-                f"finger {name!r} points along ({way}) with its joints at 0, expected +z: the frame "
+                f"finger {name!r} points along {way.round(2).tolist()} with its joints at 0, expected +z: the frame "
                 f"of body {hand.palm!r} must have fingers +z, palm normal +x"
             )
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
@@ -117,7 +116,7 @@ def check_frame(hand: Hand) -> str:
 def check_signs(hand: Hand) -> str:
     """Positive angles close: a finger's tip moves toward the palm's normal from where it is open, the thumb's to where
     its taxels face in the grasp."""
-    opened, wrong = _open(hand), []
+    opened, wrong = open_hand(hand), []
     grasp = np.asarray(hand.grasp_posture, np.float32) if hand.grasp_posture else opened
     motion = jax.jit(jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position))
     jacobian, way = np.array(motion(opened)), np.tile([1.0, 0.0, 0.0], (hand.num_fingers, 1))
@@ -167,11 +166,6 @@ def check_limits(hand: Hand) -> str:
                 f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
             )
     return ""
-
-
-def _open(hand: Hand) -> np.ndarray:
-    """Joint angles [J] rad nearest to 0 that the ranges allow."""
-    return np.clip(np.zeros(hand.num_joints, np.float32), hand.joint_lower, hand.joint_upper)
 
 
 def check_rollout(hand: Hand) -> str:

@@ -1,7 +1,6 @@
 """Primitives in place of a link's meshes: a capsule for a link, a box and its face for a palm."""
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -11,8 +10,7 @@ _SAMPLES = 600
 _CELL = 5e-3  # m, of the grid on which a palm's face is measured
 
 
-@dataclasses.dataclass(eq=False, kw_only=True)
-class Capsule:
+class Capsule(NamedTuple):
     """A segment [2, 3] m and a radius m; `error`: how far the link's convex hull is from it, mean and largest, m."""
 
     ends: np.ndarray
@@ -20,13 +18,12 @@ class Capsule:
     error: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclasses.dataclass(eq=False, kw_only=True)
-class PalmBox:
+class PalmBox(NamedTuple):
     """A box along the palm's axes: its middle and half-extents [3] m. Its face is at the largest x."""
 
     centre: np.ndarray
     half: np.ndarray
-    largest_error: float  # m, how far the palm reaches beyond it
+    beyond: float  # m, how far the palm reaches beyond it
 
 
 def fit_capsule(surface: Any, along: np.ndarray) -> Capsule:
@@ -59,7 +56,7 @@ def fit_palm(surface: Any) -> PalmBox:
     high[0] = np.nanpercentile(front, 70)
     half = np.maximum((high - low) / 2, 2e-3)
     beyond = np.maximum(low - points.min(0), points.max(0) - high).max()
-    return PalmBox(centre=(low + high) / 2, half=half, largest_error=float(beyond))
+    return PalmBox((low + high) / 2, half, float(beyond))
 
 
 def segment_distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

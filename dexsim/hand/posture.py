@@ -9,7 +9,7 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.hand.fit import segment_distance
-from dexsim.hand.kinematics import finger_bodies, flexion_joints
+from dexsim.hand.kinematics import finger_bodies, flexion_joints, open_hand
 from dexsim.hand.mjcf import hand_poses
 
 BALL = 0.028  # m, radius: the middle of the spheres that grasps are trained with
@@ -62,14 +62,9 @@ def find_grasp(hand: Hand, gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
             best_score, best = total, (centre, [row, *bends], np.array([clear[row, -1], *near]))
     centre, rows, gaps = best
     # Each posture is the open hand with one finger bent.
-    opened = _opened(hand)
+    opened = open_hand(hand)
     posture = opened + np.sum([path[row] - opened for path, row in zip([grid, *paths], rows, strict=True)], 0)
     return posture, centre, gaps
-
-
-def is_near(gaps: np.ndarray, gap: float) -> np.ndarray:
-    """Which fingertips [F] hold the ball, from `find_grasp`'s distances."""
-    return gaps < gap + _NEAR
 
 
 def _gaps(ends: np.ndarray, radius: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -77,20 +72,13 @@ def _gaps(ends: np.ndarray, radius: np.ndarray, centre: np.ndarray) -> np.ndarra
     return segment_distance(centre, ends[:, :, 0], ends[:, :, 1]) - radius - BALL
 
 
-def _opened(hand: Hand) -> np.ndarray:
-    return np.clip(0.0, hand.joint_lower, hand.joint_upper)
-
-
 def _bending(hand: Hand, finger: int) -> np.ndarray:
     """Postures [N, J] in which a finger bends more and more; hinges that swing it sideways stay."""
-    postures, shares, seen = np.tile(_opened(hand), (len(_BENDS), 1)), iter(_SHARES), set[int]()
-    flexing = flexion_joints(hand, range(finger, finger + 1))
-    for joint in hand.body_joint[finger_bodies(hand, finger)[::-1]]:
-        if joint in flexing:
-            share = next(shares)
-            if joint not in seen:  # else a hinge that follows
-                postures[:, joint] = np.clip(share * _BENDS, hand.joint_lower[joint], hand.joint_upper[joint])
-            seen.add(joint)
+    postures, flexing = np.tile(open_hand(hand), (len(_BENDS), 1)), flexion_joints(hand, range(finger, finger + 1))
+    hinges = [joint for joint in hand.body_joint[finger_bodies(hand, finger)[::-1]] if joint in flexing]
+    for joint in flexing:  # a motor that moves two hinges has the first one's share
+        share = _SHARES[hinges.index(joint)]
+        postures[:, joint] = np.clip(share * _BENDS, hand.joint_lower[joint], hand.joint_upper[joint])
     return postures
 
 
@@ -99,7 +87,7 @@ def _thumb_grid(hand: Hand) -> np.ndarray:
     joints = sorted({int(joint) for joint in hand.body_joint[finger_bodies(hand, 0)]} - {-1})
     steps = max(3, int(_THUMB_SAMPLES ** (1 / len(joints))))
     shares = np.stack(np.meshgrid(*[np.linspace(0.05, 0.95, steps)] * len(joints), indexing="ij"), -1)
-    postures = np.tile(_opened(hand), (steps ** len(joints), 1))
+    postures = np.tile(open_hand(hand), (steps ** len(joints), 1))
     low, high = hand.joint_lower[joints], hand.joint_upper[joints]
     postures[:, joints] = low + shares.reshape(-1, len(joints)) * (high - low)
     return postures
