@@ -99,17 +99,11 @@ def check_frame(hand: Hand) -> str:
     ways = (tips - roots) / np.linalg.norm(tips - roots, axis=1, keepdims=True)
     for name, way in list(zip(hand.finger_names, ways, strict=True))[1:]:
         if way[2] < _UPRIGHT:
-            return (
-                f"finger {name!r} points along {way.round(2).tolist()} with its joints at 0, expected +z: the frame "
-                f"of body {hand.palm!r} must have fingers +z, palm normal +x"
-            )
+            return f"finger {name!r} points along {way.round(2)} of {hand.palm!r} with its joints at 0, expected +z"
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
     if aside * hand.thumb_side < -_SIDEWAYS:
-        sides = "-+" if hand.side == "right" else "+-"
-        return (
-            f"the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected {sides[1]}y of a "
-            f'{hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
-        )
+        found, expected = ("-y", "+y") if hand.side == "right" else ("+y", "-y")
+        return f"the thumb is on the side of {found}, of a {hand.side} hand expected {expected}: turn palm or give side"
     return ""
 
 
@@ -127,8 +121,7 @@ def check_signs(hand: Hand) -> str:
             step = jacobian[finger, :, joint]
             if step @ way[finger] < -0.2 * np.linalg.norm(step) * np.linalg.norm(way[finger]):
                 wrong.append(hand.joint_names[joint])
-    must = "they must close the finger, toward the palm's normal +x; negate the joint's axis and range"
-    return f"positive angles open {', '.join(wrong)}: {must}" if wrong else ""
+    return f"positive angles open {', '.join(wrong)}: negate the axis and range of these joints" if wrong else ""
 
 
 def check_reach(hand: Hand) -> str:
@@ -136,21 +129,16 @@ def check_reach(hand: Hand) -> str:
     if not hand.grasp_posture or not hand.grasp_centre:
         return f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre"
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
-    away = np.linalg.norm(np.asarray(forward_kinematics(hand, posture).tip_position) - centre, axis=-1)
-    if away.min() > _REACH:
+    away = 1e3 * np.linalg.norm(forward_kinematics(hand, posture).tip_position - centre, axis=-1).min()
+    if away > 1e3 * _REACH:
         return (
-            f"[grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is {1e3 * away.min():.0f} mm "
-            f"from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is in the palm frame"
+            f"[grasp]: the fingertip nearest to centre is {away:.0f} mm from it, expected at most {1e3 * _REACH:.0f} mm"
         )
     centre[0] = palm_height(hand) + 0.005 + _BALL
     ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
     gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
-    if gap < -_OVERLAP:
-        return (
-            f"[grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm that lies "
-            "at centre: open the posture or move centre"
-        )
-    return ""
+    deep = f"{-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm at centre"
+    return f"[grasp]: a link is {deep}: open the posture or move centre" if gap < -_OVERLAP else ""
 
 
 def check_limits(hand: Hand) -> str:
@@ -159,12 +147,9 @@ def check_limits(hand: Hand) -> str:
         ("stall torque", hand.torque_limit, TORQUES, "Nm"),
         ("no-load speed", hand.speed_limit, SPEEDS, "rad/s"),
     ):
-        odd = np.flatnonzero((values < low) | (values > high))
-        if odd.size:
-            return (
-                f"joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
-                f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
-            )
+        for joint in np.flatnonzero((values < low) | (values > high)):
+            name, expected = hand.joint_names[joint], f"expected {low:g} to {high:g} {unit}"
+            return f"joint {name!r} has a {what} of {values[joint]:g} {unit}, {expected}"
     return ""
 
 
@@ -200,7 +185,10 @@ CHECKS: dict[str, Callable[[Hand], str]] = {
 
 def describe(hand: Hand) -> list[str]:
     """Motors, touch and self-collisions of a hand, a line each."""
-    lines = ["motor             range [rad]     stall [Nm]  no load [rad/s]  moves"]
+    lines = [
+        f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels",
+        "motor             range [rad]     stall [Nm]  no load [rad/s]  moves",
+    ]
     for joint, name in enumerate(hand.joint_names):
         moved = [f"{hand.body_names[b]} (x {hand.body_ratio[b]:.4g})" for b in np.flatnonzero(hand.body_joint == joint)]
         lines.append(
@@ -212,11 +200,7 @@ def describe(hand: Hand) -> list[str]:
         columns, rows = hand.taxel_grid
         lines.append(f"  {name:15s} {columns:3d} x {rows:3d} {1e6 * hand.taxel_area[finger].sum():18.0f}")
     pairs = mujoco.MjModel.from_xml_path(str(hand.model_path)).npair
-    lines.append(
-        f"self-collision: {pairs} pairs. Links touch each other where a <pair> in the MJCF says so; contype and "
-        "conaffinity only say what touches the object"
-    )
-    return lines
+    return [*lines, f"self-collision: {pairs} pairs. Links touch each other only where a <pair> in the MJCF says so"]
 
 
 def report(path: Path) -> tuple[list[str], bool]:
@@ -225,9 +209,7 @@ def report(path: Path) -> tuple[list[str], bool]:
         hand = load_hand(path)
     except AssetError as error:
         return [f"FAIL  files load: {error}"], False
-    lines = [f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels"]
-    lines += [*describe(hand), "ok    files load"]
-    passed = True
+    lines, passed = [*describe(hand), "ok    files load"], True
     for name, check in CHECKS.items():
         if check is check_rollout and not passed:
             lines.append(f"-     {name}: not tried")

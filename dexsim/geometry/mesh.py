@@ -148,10 +148,8 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
     distance, _ = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
     inside, enclosed = np.sum(distance < 0), count * mesh.volume / np.prod(high - low)
     if abs(inside - enclosed) > 0.1 * enclosed + 4 * np.sqrt(enclosed):
-        raise AssetError(
-            f"{mesh.metadata['name']}: cannot be signed: {inside} of {count} random points are inside, expected "
-            f"{enclosed:.0f} by its volume; the surface cuts through itself or a part is inside out"
-        )
+        why = f"{inside} of {count} random points are inside, expected {enclosed:.0f}; it cuts through itself"
+        raise AssetError(f"{mesh.metadata['name']}: cannot be signed: {why}, or a part is inside out")
 
 
 def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

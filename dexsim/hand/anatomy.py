@@ -33,10 +33,7 @@ def orient(draft: Draft, *, thumb: str = "", along: Direction | None = None, nor
     parents = {link.parent for link in links}
     chains = [_chain(links, at) for at in range(1, len(links)) if at not in parents]
     if not 2 <= len(chains) <= 6:
-        raise AssetError(
-            f"{draft.name}: expected 2 to 6 fingers, got {len(chains)} chains of hinges; --palm BODY chooses a "
-            "hand, --freeze JOINT fixes a hinge that is no finger's"
-        )
+        raise AssetError(f"{draft.name}: expected 2 to 6 fingers, got {len(chains)}; see --palm BODY, --freeze JOINT")
     first = chains.pop(_find_thumb(draft, chains, thumb))
     rotation = _find_frame(links, chains, along, normal)
     for link in links:
@@ -132,10 +129,7 @@ def _find_frame(
     values, vectors = np.linalg.eigh(axes.T @ axes)
     across, given = vectors[:, -1], along is not None or normal is not None
     if values[-1] < 0.8 * len(fingers) and (along is None or normal is None):
-        raise AssetError(
-            "the fingers' last joints are not parallel, so no palm side is found: give --fingers and --normal, "
-            "directions in the file's axes in which the fingers point and the palm faces"
-        )
+        raise AssetError("no palm side found, the fingers' last joints are not parallel: give --fingers and --normal")
     arms = [_unit(tip_of(links, chain) - links[chain[0]].anchor) for chain in fingers]
     z = _unit(np.mean(arms, 0) if along is None else np.asarray(along))
     x = np.asarray(normal)

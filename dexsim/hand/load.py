@@ -239,12 +239,10 @@ def read_coupling(model: Any, index: int) -> tuple[int, int, float, float] | Non
     first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
     if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[index]:
         return None
-    a0, ratio, *higher = model.eq_data[index, :5]
+    a0, ratio, *higher = polycoef = model.eq_data[index, :5].tolist()
     if any(higher) or not ratio:
-        raise ConfigError(
-            f"joint {model.joint(first).name!r} follows {model.joint(second).name!r} by the polycoef "
-            f"{model.eq_data[index, :5].tolist()}; only an offset and a ratio are supported: a0 a1 0 0 0"
-        )
+        name, leader = (model.joint(joint).name for joint in (first, second))
+        raise ConfigError(f"joint {name!r} follows {leader!r} by the polycoef {polycoef}, expected a0 a1 0 0 0")
     reference = model.qpos0[model.jnt_qposadr[[first, second]]]
     return first, second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
 
@@ -271,10 +269,8 @@ def _read_followers(model: Any, motors: list[int]) -> dict[int, tuple[int, float
         reach = np.sort(ratio * model.jnt_range[second] + offset)
         low, high = model.jnt_range[first]
         if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
-            raise ConfigError(
-                f"joint {name!r} has the range {low:.4g} to {high:.4g} rad, and {leader!r} takes it from "
-                f"{reach[0]:.4g} to {reach[1]:.4g}"
-            )
+            taken = f"{leader!r} takes it from {reach[0]:.4g} to {reach[1]:.4g}"
+            raise ConfigError(f"joint {name!r} has the range {low:.4g} to {high:.4g} rad, and {taken}")
     return followers
 
 
@@ -287,8 +283,7 @@ def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int
     hinges = np.all(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     if len(joints) != motors or len(set(joints)) != motors or not hinges:
         raise ConfigError(
-            f"joints lists {len(set(joints))} of the {motors} joints of {table.model}; every joint must be "
-            "a hinge, and be listed once or follow one by an equality"
+            f"joints lists {len(set(joints))} of the {motors} joints that follow none, expected all: hinges"
         )
     postures = {"grasp.posture": table.grasp.posture, "rotate.posture": table.rotate.posture}
     for name, values in {"speed_limits": table.speed_limits, "gains": table.gains, **postures}.items():
@@ -297,10 +292,7 @@ def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int
     for place, (name, joint) in enumerate(zip(table.joints, joints, strict=True)):
         (low, high), torque = model.jnt_range[joint], model.jnt_actfrcrange[joint]
         if not model.jnt_limited[joint] or torque[1] <= 0 or not np.isclose(torque[0], -torque[1]):
-            raise ConfigError(
-                f"{table.model}: joint {name!r} needs a range, and an actuatorfrcrange from -T to T, its stall torque; "
-                f"got {torque[0]:g} to {torque[1]:g} Nm"
-            )
+            raise ConfigError(f"joint {name!r} needs a range, and its stall torque as actuatorfrcrange, got {torque}")
         for angle in (posture[place] for posture in postures.values() if posture):
             if not low - _SLACK <= angle <= high + _SLACK:
                 span = f"{low:.4g} to {high:.4g} rad"
@@ -312,9 +304,7 @@ def _hinges_of_bodies(model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
     hinges = np.full(len(row), -1)
     for joint, body in enumerate(model.jnt_bodyid.tolist()):
         if body not in row or body == palm or hinges[row[body]] >= 0:
-            raise ConfigError(
-                f"joint {model.joint(joint).name!r} must be the only joint of a body below {model.body(palm).name!r}"
-            )
+            raise ConfigError(f"joint {model.joint(joint).name!r} must be the only joint of a body below the palm")
         hinges[row[body]] = joint
     return hinges
 
@@ -383,10 +373,8 @@ def _read_geoms(model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
         if body not in row:
             continue
         if kind is None and touches:
-            raise ConfigError(
-                f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r} is no primitive and "
-                "touches: meshes are drawn only (contype and conaffinity 0); use capsules, spheres or boxes"
-            )
+            which = f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r}"
+            raise ConfigError(f"{which} is no primitive and touches: meshes need contype and conaffinity 0")
         if kind is not None:
             size, position, rotation = model.geom_size[g], model.geom_pos[g], _matrix(model.geom_quat[g])
             geoms.append(Geom(model.geom(g).name, kind, row[body], _f32(size), _f32(position), _f32(rotation), touches))

@@ -193,11 +193,9 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
 
 def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
     if not allowed:
-        raise ConfigError(
-            f"tendons {', '.join(tendon.name for tendon in spec.tendons)[:60]}: not supported; --drop-tendons "
-            "gives each of their joints a motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another "
-            "(ratio of their angles)"
-        )
+        names = ", ".join(tendon.name for tendon in spec.tendons)[:60]
+        remedy = "--drop-tendons gives each of their joints a motor, --couple FOLLOWER=LEADER:RATIO couples two"
+        raise ConfigError(f"tendons {names}: not supported; {remedy}")
     pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
     for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
         spec.delete(element)

@@ -119,11 +119,9 @@ def fit_boxes(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) ->
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
         mean, worst = (1e3 * off for off in boxes.deviation)
-        raise AssetError(
-            f"{mesh.metadata['name']}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
-            f"average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
-            "(ObjectConfig.mesh_parts)"
-        )
+        off = f"{mean:.2g} mm off on average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm"
+        what = f"{mesh.metadata['name']}: {len(boxes.size)} boxes do not follow its surface"
+        raise AssetError(f"{what}, {off}; allow more (ObjectConfig.mesh_parts)")
     return boxes
 
 
@@ -168,10 +166,8 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
     distance = meshes.signed_distance(mesh, points)[0].reshape(shape)
     inside, left = distance < 0, distance < 0
     if not inside.any():
-        raise AssetError(
-            f"a mesh of {1000 * float((high - low).max()):.0f} mm has no inside at a resolution of {1000 * pitch:.1f} "
-            "mm: its walls are too thin for boxes; give it as a solid"
-        )
+        size = f"a mesh of {1000 * _VOXELS * pitch:.0f} mm has no inside at a resolution of {1000 * pitch:.1f} mm"
+        raise AssetError(f"{size}: its walls are too thin for boxes; give it as a solid")
     boxes: list[np.ndarray] = []
     for _ in range(parts):
         if left.sum() < 0.01 * inside.sum():
