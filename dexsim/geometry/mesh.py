@@ -96,20 +96,8 @@ def fingerprint(mesh: Trimesh) -> str:
     return digest.hexdigest()
 
 
-def signed_distance(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface a face's normal), at points."""
-    points = np.asarray(points, np.float64).reshape(-1, 3)
-    nearest, normal = find_nearest(mesh, points)
-    apart = points - nearest
-    gap = np.linalg.norm(apart, axis=-1)
-    sign = np.where(np.sum(apart * normal, -1) < 0, -1.0, 1.0)
-    close = gap < 1e-9
-    gradient = np.where(close[:, None], normal, sign[:, None] * apart / np.where(close, 1.0, gap)[:, None])
-    return sign * gap, gradient
-
-
-def find_nearest(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest surface point [P, 3], and the normal [P, 3] of the triangle there that tells inside from outside.
+def signed_distance(mesh: Trimesh, points: np.ndarray) -> np.ndarray:
+    """Exact distance [P] m, negative inside, at points [P, 3] m.
 
     No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
     measure for each point.
@@ -120,22 +108,20 @@ def find_nearest(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
     middle = (corners.min(1) + corners.max(1)) / 2
     radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + _TIE
-    nearest, normal = np.empty_like(points), np.empty_like(points)
-    step = max(1, BLOCK // len(corners))
+    distance, step = np.empty(len(points)), max(1, BLOCK // len(corners))
     for start in range(0, len(points), step):
         some = points[start : start + step]
         row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
-        candidate = trimesh.triangles.closest_point(corners[face], some[row])
-        apart = some[row] - candidate
+        apart = some[row] - trimesh.triangles.closest_point(corners[face], some[row])
         gap = np.linalg.norm(apart, axis=-1)
         least = np.full(len(some), np.inf)
         np.minimum.at(least, row, gap)
-        tied = gap <= least[row] + _TIE
-        off_plane = np.where(tied, np.abs(np.sum(apart * normals[face], -1)), -1.0)
-        order = np.lexsort((-off_plane, row))
-        first = order[np.searchsorted(row[order], np.arange(len(some)))]
-        nearest[start : start + step], normal[start : start + step] = candidate[first], normals[face[first]]
-    return nearest, normal
+        off_plane = np.sum(apart * normals[face], -1)
+        # The last triangle of each point is the one that tells inside from outside.
+        order = np.lexsort((np.where(gap <= least[row] + _TIE, np.abs(off_plane), -1.0), row))
+        last = order[np.searchsorted(row[order], np.arange(len(some)), side="right") - 1]
+        distance[start : start + step] = np.where(off_plane[last] < 0, -1.0, 1.0) * gap[last]
+    return distance
 
 
 def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
@@ -145,7 +131,7 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
       AssetError: they differ by more than a tenth and the error of sampling: the mesh cannot be signed.
     """
     low, high = mesh.bounds
-    distance, _ = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
+    distance = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
     inside, enclosed = np.sum(distance < 0), count * mesh.volume / np.prod(high - low)
     if abs(inside - enclosed) > 0.1 * enclosed + 4 * np.sqrt(enclosed):
         why = f"{inside} of {count} random points are inside, expected {enclosed:.0f}; it cuts through itself"

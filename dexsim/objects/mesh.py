@@ -133,7 +133,7 @@ def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxe
     low, high = mesh.bounds + [[-0.03 * extent], [0.03 * extent]]
     near = skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal
     points = np.concatenate([near, rng.uniform(low, high, (1500, 3))])
-    distance, _ = meshes.signed_distance(mesh, points)
+    distance = meshes.signed_distance(mesh, points)
     candidates = []
     for frame in frames:
         start = _start(mesh, frame, parts, rng)
@@ -163,7 +163,7 @@ def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[n
     cell = (high - low) / shape
     centres = [low[k] + cell[k] * (np.arange(shape[k]) + 0.5) for k in range(3)]
     points = np.stack(np.meshgrid(*centres, indexing="ij"), -1).reshape(-1, 3)
-    distance = meshes.signed_distance(mesh, points)[0].reshape(shape)
+    distance = meshes.signed_distance(mesh, points).reshape(shape)
     inside, left = distance < 0, distance < 0
     if not inside.any():
         size = f"a mesh of {1000 * _VOXELS * pitch:.0f} mm has no inside at a resolution of {1000 * pitch:.1f} mm"
@@ -242,7 +242,7 @@ def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> B
     # Of the boxes' own surfaces what is in no other box.
     points = meshes.sample_surface(trimesh.util.concatenate(sides), 8000, rng)[0]
     outside = np.asarray(sdf.signed_distance(points.astype(np.float32), shape)) > -1e-5
-    back = np.abs(meshes.signed_distance(mesh, points[outside][:2000])[0])
+    back = np.abs(meshes.signed_distance(mesh, points[outside][:2000]))
     skin = meshes.sample_surface(mesh, 2000, rng)[0].astype(np.float32)
     both = np.append(np.abs(sdf.signed_distance(skin, shape)), back)
     return dataclasses.replace(boxes, deviation=(float(both.mean()), float(np.percentile(both, 99))))

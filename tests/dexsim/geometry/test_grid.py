@@ -43,14 +43,7 @@ def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
 def test_distance_to_a_box_mesh_is_the_closed_form():
     box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
-    value, gradient = mesh.signed_distance(box, points)
-    np.testing.assert_allclose(value, box_distance(points), atol=1e-12)
-    step = 1e-7
-    numeric = np.stack(
-        [(box_distance(points + step * e) - box_distance(points - step * e)) / (2 * step) for e in np.eye(3)], -1
-    )
-    smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-4
-    np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
+    np.testing.assert_allclose(mesh.signed_distance(box, points), box_distance(points), atol=1e-12)
 
 
 def turned(part):
@@ -114,7 +107,7 @@ def test_a_hollow_ball_is_signed_right():
     outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.03, 0.02))
     hollow = mesh.load_mesh(trimesh.util.concatenate([outer, turned(inner)]))
     mesh.check_sign(hollow)
-    value, _ = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
+    value = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
     np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
 
 
