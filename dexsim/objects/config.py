@@ -86,16 +86,6 @@ class ObjectConfig(Config):
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """Names in KINDS of what is drawn."""
-        return ("mesh",) if self.mesh else self.shapes
-
-    @property
-    def ranges(self) -> tuple[str, ...]:
-        """Fields that are drawn for every object."""
-        return (*(("mesh_size",) if self.mesh else SIZE_RANGES), *PROPERTY_RANGES)
-
-    @property
     def slots(self) -> tuple[str, ...]:
         """Primitives of the compiled template: those that its shapes need."""
         if self.mesh:

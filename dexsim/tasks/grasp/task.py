@@ -26,7 +26,7 @@ from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
-from dexsim.objects.config import KINDS
+from dexsim.objects.config import KINDS, PROPERTY_RANGES, SIZE_RANGES
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
@@ -108,7 +108,8 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
-        self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
+        sizes = ("mesh_size",) if config.objects.mesh else SIZE_RANGES
+        self.object_ranges = tuple(f"objects.{name}" for name in (*sizes, *PROPERTY_RANGES))
         self._roots, self._closing = hand.root_joint, closing(hand)
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
@@ -189,7 +190,7 @@ class Grasp(Task):
     @property
     def drawn_shapes(self) -> tuple[str, ...]:
         """Names, of `shape_names`, of what the pool has."""
-        return self.config.objects.kinds
+        return ("mesh",) if self.config.objects.mesh else self.config.objects.shapes
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         del start
