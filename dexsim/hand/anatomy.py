@@ -37,7 +37,10 @@ def orient(draft: Draft, *, thumb: str = "", along: Direction | None = None, nor
     first = chains.pop(_find_thumb(draft, chains, thumb))
     rotation = _find_frame(links, chains, along, normal)
     for link in links:
-        _turn(link, rotation)
+        link.axis, link.anchor, link.centre = (rotation @ vector for vector in (link.axis, link.anchor, link.centre))
+        link.inertia = rotation @ link.inertia @ rotation.T
+        if link.surface is not None:
+            link.surface.vertices = np.asarray(link.surface.vertices) @ rotation.T
     chains.sort(key=lambda chain: _aside(links, chain))
     thumb_side = _aside(links, first) - np.mean([_aside(links, chain) for chain in chains])
     if thumb_side > 0:
@@ -148,13 +151,6 @@ def _bend(links: Sequence[Link], chain: Sequence[int]) -> np.ndarray:
     """Which way [3] a finger's tip moves when it bends: farther to the front than to the back."""
     tip, flexing = tip_of(links, chain), [links[at] for at in flexion_links(links, chain)]
     return np.sum([(link.low + link.high) * np.cross(link.axis, tip - link.anchor) for link in flexing], 0)
-
-
-def _turn(link: Link, rotation: np.ndarray) -> None:
-    link.axis, link.anchor, link.centre = rotation @ link.axis, rotation @ link.anchor, rotation @ link.centre
-    link.inertia = rotation @ link.inertia @ rotation.T
-    if link.surface is not None:
-        link.surface.vertices = np.asarray(link.surface.vertices) @ rotation.T
 
 
 def _close_positive(draft: Draft) -> list[str]:

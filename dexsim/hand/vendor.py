@@ -209,13 +209,12 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
             bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
             raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
         return at
-    chains: dict[int, list[int]] = {}
-    for body in {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}:
-        chains[body] = [body]
-        while chains[body][-1]:
-            chains[body].append(int(model.body_parentid[chains[body][-1]]))
-    inner = {above for chain in chains.values() for above in chain[1:]}
-    fingers = [chain for body, chain in chains.items() if body not in inner]
+    fingers: list[list[int]] = []
+    for body in sorted({int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}):
+        chain = [body]
+        while chain[-1]:
+            chain.append(int(model.body_parentid[chain[-1]]))
+        fingers = [other for other in fingers if other[0] not in chain] + [chain]  # parents come before children
     if len(fingers) < 2:
         raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
     return next(body for body in fingers[0] if all(body in chain for chain in fingers))

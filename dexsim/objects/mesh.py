@@ -32,7 +32,7 @@ _VOXELS = 28  # along the longest side
 _SEEDS = 120  # boxes grown for every one that is kept
 _STEPS = 400  # of the refinement, at most
 _ALIKE = 0.002  # fits whose mean deviations differ by less, as a share of the mesh's size, are as good
-_WORST = (0.025, 0.1)  # largest deviation, mean and 99th percentile, as a share of the mesh's size
+_WORST = (0.025, 0.1)  # largest deviation, as a share of the mesh's size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Boxes:
     size: np.ndarray  # [K, 3] m, half-extents
     position: np.ndarray  # [K, 3] m
     quat: np.ndarray  # [K, 4]
-    deviation: tuple[float, ...]  # m, between the two surfaces: mean and 99th percentile
+    deviation: np.ndarray  # [2] m, between the two surfaces: mean and 99th percentile
 
     def shape(self) -> sdf.Shape:
         """The union, for distances."""
@@ -75,8 +75,11 @@ def load(path: str, *, unit: float, parts: int, repair: str = "none", changed: i
     """The object of a mesh file, in any format that trimesh reads, with `parts` boxes at most; `unit` is the file's, m,
     and `repair` what to do if it is not closed (`geometry.mesh.load_mesh`). Kept until the time `changed` is another.
 
+    What was fitted once is kept in the cache.
+
     Raises:
-      AssetError: no such file, not closed, or not to be followed by so many boxes.
+      AssetError: no such file, not closed, its inside cannot be determined, or so many boxes do not follow it (2.5 % of
+        its size off on average, or 10 % at the 99th percentile).
     """
     with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
         mesh = meshes.load_mesh(path, scale=unit, repair=repair)
@@ -86,7 +89,15 @@ def load(path: str, *, unit: float, parts: int, repair: str = "none", changed: i
         own = meshes.make_mesh(mesh.metadata["name"], (mesh.vertices - origin) @ axes, mesh.faces)
         # An L has its bars along the axes of its file.
         frames = [np.eye(3)] if np.array_equal(axes, np.eye(3)) else [np.eye(3), axes.T]
-        return MeshObject(own, fit_boxes(own, parts, frames), np.diag(axes.T @ tensor @ axes).astype(np.float32))
+        key = f"{meshes.fingerprint(own)} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
+        boxes = Boxes(**cached_arrays("boxes", key, lambda: vars(_fit(own, parts, frames))))
+    extent = np.ptp(own.vertices, axis=0).max()
+    if np.any(boxes.deviation > np.array(_WORST) * extent):
+        mean, worst = 1e3 * boxes.deviation
+        off = f"{mean:.2g} mm off on average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm"
+        what = f"{mesh.metadata['name']}: {len(boxes.size)} boxes do not follow its surface"
+        raise AssetError(f"{what}, {off}; allow more (ObjectConfig.mesh_parts)")
+    return MeshObject(own, boxes, np.diag(axes.T @ tensor @ axes).astype(np.float32))
 
 
 def principal_axes(tensor: np.ndarray) -> np.ndarray:
@@ -103,29 +114,8 @@ def principal_axes(tensor: np.ndarray) -> np.ndarray:
     return axes
 
 
-def fit_boxes(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
-    """At most `parts` boxes for a mesh; what was fitted once is kept in the cache.
-
-    Args:
-      frames: rotations [3, 3] whose columns boxes may start along; the best start is used.
-
-    Raises:
-      AssetError: so many boxes do not follow it (2.5 % of its size off on average, or 10 % at the 99th
-        percentile), or its inside cannot be determined.
-    """
-    key = f"{meshes.fingerprint(mesh)} {parts} {np.round(frames, 5).tolist()} {_VERSION}"
-    arrays = cached_arrays("boxes", key, lambda: vars(_fit(mesh, parts, frames)))
-    boxes = Boxes(arrays["size"], arrays["position"], arrays["quat"], tuple(map(float, arrays["deviation"])))
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
-    if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
-        mean, worst = (1e3 * off for off in boxes.deviation)
-        off = f"{mean:.2g} mm off on average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm"
-        what = f"{mesh.metadata['name']}: {len(boxes.size)} boxes do not follow its surface"
-        raise AssetError(f"{what}, {off}; allow more (ObjectConfig.mesh_parts)")
-    return boxes
-
-
 def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
+    """At most `parts` boxes, which start along the columns of one of the rotations [3, 3]; the best start is used."""
     meshes.check_sign(mesh)
     rng = np.random.default_rng(0)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
@@ -234,7 +224,7 @@ def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> B
     import trimesh
 
     position, size, quat = np.split(fit.astype(np.float32), [3, 6], axis=1)
-    boxes = Boxes(np.exp(size), position, quat / np.linalg.norm(quat, axis=1, keepdims=True), (0.0, 0.0))
+    boxes = Boxes(np.exp(size), position, quat / np.linalg.norm(quat, axis=1, keepdims=True), np.zeros(2))
     shape = boxes.shape()
     sides = [trimesh.creation.box(2 * half) for half in boxes.size]
     for side, place, turn in zip(sides, position, np.asarray(shape.rotation), strict=True):
@@ -245,4 +235,4 @@ def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> B
     back = np.abs(meshes.signed_distance(mesh, points[outside][:2000]))
     skin = meshes.sample_surface(mesh, 2000, rng)[0].astype(np.float32)
     both = np.append(np.abs(sdf.signed_distance(skin, shape)), back)
-    return dataclasses.replace(boxes, deviation=(float(both.mean()), float(np.percentile(both, 99))))
+    return dataclasses.replace(boxes, deviation=np.array([both.mean(), np.percentile(both, 99)]))
