@@ -71,10 +71,8 @@ def check_taxels(hand: Hand) -> str:
         parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.KINDS]
         if not parts:
             continue
-        arrays = {
-            field: np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")
-        }
-        shape = sdf.Shape(kinds=tuple(part.kind for part in parts), active=np.ones(len(parts), bool), **arrays)
+        arrays = [np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")]
+        shape = sdf.Shape(tuple(part.kind for part in parts), *arrays, np.ones(len(parts), bool))
         position, normal = hand.taxel_position[finger], hand.taxel_normal[finger]
         distance, ahead = (np.asarray(sdf.signed_distance(position + s * normal, shape)) for s in (0.0, _STEP))
         depth, away = -1e3 * distance.min(), 1e3 * distance.max()
@@ -131,9 +129,7 @@ def check_reach(hand: Hand) -> str:
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
     away = 1e3 * np.linalg.norm(forward_kinematics(hand, posture).tip_position - centre, axis=-1).min()
     if away > 1e3 * _REACH:
-        return (
-            f"[grasp]: the fingertip nearest to centre is {away:.0f} mm from it, expected at most {1e3 * _REACH:.0f} mm"
-        )
+        return f"[grasp]: the fingertip nearest to centre is {away:.0f} mm away, expected {1e3 * _REACH:.0f} mm at most"
     centre[0] = palm_height(hand) + 0.005 + _BALL
     ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
     gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
