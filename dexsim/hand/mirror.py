@@ -138,7 +138,7 @@ def mirror_taxels(text: str) -> str:
     A lattice that is its own mirror image stays as it is, index by index: it is the same part on either hand, and its
     columns run the same way round the finger.
     """
-    head, *rows = [line.split(",") for line in text.splitlines()]
+    head, *rows = [line.split(",") for line in text.splitlines() if line]
     for finger in {row[0] for row in rows}:
         taxels = [row for row in rows if row[0] == finger]
         place = np.array([row[3:6] for row in taxels], float)
