@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dexsim import check_hand, import_hand
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
-from dexsim.hand.fit import fit_capsule, segment_distance
+from dexsim.hand.fit import fit_capsule
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
@@ -227,7 +227,3 @@ def test_a_capsule_is_fitted_to_itself():
     fit = fit_capsule(bar, turn @ [0.1, 0, 0.995])
     np.testing.assert_allclose(fit.ends, [-length / 2 * turn[:, 2], length / 2 * turn[:, 2]], atol=3e-4)
     assert abs(fit.radius - radius) < 1e-4 and fit.error[1] < 3e-4
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
-    steps = fit.ends[0] + np.linspace(0, 1, 2001)[:, None] * (fit.ends[1] - fit.ends[0])
-    brute = np.linalg.norm(points[:, None] - steps, axis=-1).min(1)
-    np.testing.assert_allclose(segment_distance(points, *fit.ends), brute, atol=1e-5)
