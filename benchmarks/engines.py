@@ -126,7 +126,7 @@ class Motions:
             target = np.clip(0.0, hand.joint_lower, hand.joint_upper)
             qpos[scene.joint_qpos] = target
             down = np.float32([-1.0, 0.0, 0.0])
-            height = float(extent(object.size, object.position, object.active, down, object.kinds, object.quat))
+            height = float(extent(object, down))
             # Where palms are half-spaces nothing else of the hand is near; boxes have the palm's middle.
             beside = (0.0, -0.5) if len(scene.slots) > 1 else (0.0, 0.085)
             # Boxes that are parallel to each other are a special case, whose contacts hang on the last digit.

@@ -24,7 +24,7 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
 from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics
+from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, open_hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import hand_poses
 from dexsim.tasks.grasp.config import GraspConfig
@@ -60,10 +60,9 @@ def check_kinematics(hand: Hand) -> str:
 
 def check_fingertips(hand: Hand) -> str:
     """Every fingertip has a primitive that touches the object; a mesh does not count."""
-    for name, body in zip(hand.finger_names, hand.tip_body, strict=True):
-        if not any(geom.touches and geom.body == body for geom in hand.geoms):
-            return f"finger {name!r} has no primitive at its tip that touches (no mesh)"
-    return ""
+    touching = {geom.body for geom in hand.geoms if geom.touches}
+    bare = [name for name, body in zip(hand.finger_names, hand.tip_body, strict=True) if body not in touching]
+    return f"finger {bare[0]!r} has no primitive at its tip that touches (no mesh)" if bare else ""
 
 
 def check_taxels(hand: Hand) -> str:
@@ -72,10 +71,8 @@ def check_taxels(hand: Hand) -> str:
         parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.KINDS]
         if not parts:
             continue
-        arrays = {
-            field: np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")
-        }
-        shape = sdf.Shape(kinds=tuple(part.kind for part in parts), active=np.ones(len(parts), bool), **arrays)
+        arrays = [np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")]
+        shape = sdf.Shape(tuple(part.kind for part in parts), *arrays, np.ones(len(parts), bool))
         position, normal = hand.taxel_position[finger], hand.taxel_normal[finger]
         distance, ahead = (np.asarray(sdf.signed_distance(position + s * normal, shape)) for s in (0.0, _STEP))
         depth, away = -1e3 * distance.min(), 1e3 * distance.max()
@@ -94,30 +91,24 @@ def check_taxels(hand: Hand) -> str:
 def check_frame(hand: Hand) -> str:
     """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of
     -y."""
-    pose = forward_kinematics(hand, _open(hand))
+    pose = forward_kinematics(hand, open_hand(hand))
     tips, bodies = np.asarray(pose.tip_position), np.asarray(pose.body_position)
     roots = np.array([bodies[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
-    for name, arm in list(zip(hand.finger_names, tips - roots, strict=True))[1:]:
-        if arm[2] < _UPRIGHT * np.linalg.norm(arm):
-            way = ", ".join(f"{x:.2f}" for x in arm / np.linalg.norm(arm))
-            return (
-                f"finger {name!r} points along ({way}) with its joints at 0, expected +z: the frame "
-                f"of body {hand.palm!r} must have fingers +z, palm normal +x"
-            )
+    ways = (tips - roots) / np.linalg.norm(tips - roots, axis=1, keepdims=True)
+    for name, way in list(zip(hand.finger_names, ways, strict=True))[1:]:
+        if way[2] < _UPRIGHT:
+            return f"finger {name!r} points along {way.round(2)} of {hand.palm!r} with its joints at 0, expected +z"
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
     if aside * hand.thumb_side < -_SIDEWAYS:
-        sides = "-+" if hand.side == "right" else "+-"
-        return (
-            f"the thumb is {1e3 * abs(aside):.0f} mm to the side of {sides[0]}y, expected {sides[1]}y of a "
-            f'{hand.side} hand: turn the palm frame, or give side = "left" or "right" in the TOML'
-        )
+        found, expected = ("-y", "+y") if hand.side == "right" else ("+y", "-y")
+        return f"the thumb is on the side of {found}, of a {hand.side} hand expected {expected}: turn palm or give side"
     return ""
 
 
 def check_signs(hand: Hand) -> str:
     """Positive angles close: a finger's tip moves toward the palm's normal from where it is open, the thumb's to where
     its taxels face in the grasp."""
-    opened, wrong = _open(hand), []
+    opened, wrong = open_hand(hand), []
     grasp = np.asarray(hand.grasp_posture, np.float32) if hand.grasp_posture else opened
     motion = jax.jit(jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position))
     jacobian, way = np.array(motion(opened)), np.tile([1.0, 0.0, 0.0], (hand.num_fingers, 1))
@@ -128,8 +119,7 @@ def check_signs(hand: Hand) -> str:
             step = jacobian[finger, :, joint]
             if step @ way[finger] < -0.2 * np.linalg.norm(step) * np.linalg.norm(way[finger]):
                 wrong.append(hand.joint_names[joint])
-    must = "they must close the finger, toward the palm's normal +x; negate the joint's axis and range"
-    return f"positive angles open {', '.join(wrong)}: {must}" if wrong else ""
+    return f"positive angles open {', '.join(wrong)}: negate the axis and range of these joints" if wrong else ""
 
 
 def check_reach(hand: Hand) -> str:
@@ -137,21 +127,14 @@ def check_reach(hand: Hand) -> str:
     if not hand.grasp_posture or not hand.grasp_centre:
         return f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre"
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
-    away = np.linalg.norm(np.asarray(forward_kinematics(hand, posture).tip_position) - centre, axis=-1)
-    if away.min() > _REACH:
-        return (
-            f"[grasp]: the nearest fingertip, {hand.finger_names[int(away.argmin())]!r}, is {1e3 * away.min():.0f} mm "
-            f"from centre in the posture, expected {1e3 * _REACH:.0f} mm at most; centre is in the palm frame"
-        )
+    away = 1e3 * np.linalg.norm(forward_kinematics(hand, posture).tip_position - centre, axis=-1).min()
+    if away > 1e3 * _REACH:
+        return f"[grasp]: the fingertip nearest to centre is {away:.0f} mm away, expected {1e3 * _REACH:.0f} mm at most"
     centre[0] = palm_height(hand) + 0.005 + _BALL
     ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
     gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
-    if gap < -_OVERLAP:
-        return (
-            f"[grasp]: in the posture a link is {-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm that lies "
-            "at centre: open the posture or move centre"
-        )
-    return ""
+    deep = f"{-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm at centre"
+    return f"[grasp]: a link is {deep}: open the posture or move centre" if gap < -_OVERLAP else ""
 
 
 def check_limits(hand: Hand) -> str:
@@ -160,18 +143,10 @@ def check_limits(hand: Hand) -> str:
         ("stall torque", hand.torque_limit, TORQUES, "Nm"),
         ("no-load speed", hand.speed_limit, SPEEDS, "rad/s"),
     ):
-        odd = np.flatnonzero((values < low) | (values > high))
-        if odd.size:
-            return (
-                f"joint {hand.joint_names[odd[0]]!r} has a {what} of {values[odd[0]]:g} {unit}, "
-                f"expected {low:g} to {high:g} {unit} ({odd.size} joints)"
-            )
+        for joint in np.flatnonzero((values < low) | (values > high)):
+            name, expected = hand.joint_names[joint], f"expected {low:g} to {high:g} {unit}"
+            return f"joint {name!r} has a {what} of {values[joint]:g} {unit}, {expected}"
     return ""
-
-
-def _open(hand: Hand) -> np.ndarray:
-    """Joint angles [J] rad nearest to 0 that the ranges allow."""
-    return np.clip(np.zeros(hand.num_joints, np.float32), hand.joint_lower, hand.joint_upper)
 
 
 def check_rollout(hand: Hand) -> str:
@@ -206,7 +181,10 @@ CHECKS: dict[str, Callable[[Hand], str]] = {
 
 def describe(hand: Hand) -> list[str]:
     """Motors, touch and self-collisions of a hand, a line each."""
-    lines = ["motor             range [rad]     stall [Nm]  no load [rad/s]  moves"]
+    lines = [
+        f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels",
+        "motor             range [rad]     stall [Nm]  no load [rad/s]  moves",
+    ]
     for joint, name in enumerate(hand.joint_names):
         moved = [f"{hand.body_names[b]} (x {hand.body_ratio[b]:.4g})" for b in np.flatnonzero(hand.body_joint == joint)]
         lines.append(
@@ -218,11 +196,7 @@ def describe(hand: Hand) -> list[str]:
         columns, rows = hand.taxel_grid
         lines.append(f"  {name:15s} {columns:3d} x {rows:3d} {1e6 * hand.taxel_area[finger].sum():18.0f}")
     pairs = mujoco.MjModel.from_xml_path(str(hand.model_path)).npair
-    lines.append(
-        f"self-collision: {pairs} pairs. Links touch each other where a <pair> in the MJCF says so; contype and "
-        "conaffinity only say what touches the object"
-    )
-    return lines
+    return [*lines, f"self-collision: {pairs} pairs. Links touch each other only where a <pair> in the MJCF says so"]
 
 
 def report(path: Path) -> tuple[list[str], bool]:
@@ -231,9 +205,7 @@ def report(path: Path) -> tuple[list[str], bool]:
         hand = load_hand(path)
     except AssetError as error:
         return [f"FAIL  files load: {error}"], False
-    lines = [f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels"]
-    lines += [*describe(hand), "ok    files load"]
-    passed = True
+    lines, passed = [*describe(hand), "ok    files load"], True
     for name, check in CHECKS.items():
         if check is check_rollout and not passed:
             lines.append(f"-     {name}: not tried")

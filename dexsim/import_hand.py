@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import trimesh
@@ -22,15 +22,14 @@ from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
-from dexsim.hand.anatomy import orient, tip_of
-from dexsim.hand.description import Hand
+from dexsim.hand.anatomy import Direction, orient, tip_of
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
-from dexsim.hand.folder import root_joint, write_hand
+from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength
 from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import swap_sides, write_mirror
-from dexsim.hand.posture import find_grasp, is_near
-from dexsim.hand.vendor import Draft, Link, read_hand
+from dexsim.hand.posture import find_grasp
+from dexsim.hand.vendor import LEAST_MASS, Draft, Link, read_hand
 
 _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
@@ -38,7 +37,7 @@ _RUBBER = 0.003  # m, by which the environment enlarges fingertips (`PhysicsConf
 _GAPS = (0.006, 0.010, 0.015, 0.020)  # m, between ball and links; the first that leaves room for boxes is taken
 _PRESSING = 2.75  # fingers that oppose the thumb at once: gives the XHand's highest target, 4.8 N, of its 13.2 N
 _CARRYING = 1.0  # N, of each of two fingers that carry 0.2 kg, the heaviest of the default objects
-_DENSITY, _LEAST_MASS = 1000.0, 1e-3  # kg/m^3 and kg, of links without a mass
+_DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +55,10 @@ class ImportArguments(Config):
     """Body of the palm; empty for the one where all fingers begin."""
     thumb: str = ""
     """A link or joint of the thumb; empty to find it."""
-    fingers: str = ""
-    """Axis of the file along which the fingers point, as +z or 0,0.5,1; empty to find it."""
-    normal: str = ""
-    """Axis of the file that the palm faces; empty to find it."""
+    fingers: Direction | None = None
+    """Direction in the file's axes in which the fingers point, as 0 0 1; None to find it."""
+    normal: Direction | None = None
+    """Direction in the file's axes that the palm faces; None to find it."""
     freeze: tuple[str, ...] = ()
     """Joints to fix at 0. Joints above the palm are fixed anyway."""
     couple: tuple[str, ...] = ()
@@ -104,68 +103,37 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
         couple=arguments.couple,
         drop_tendons=arguments.drop_tendons,
     )
-    along, normal = (parse_axis(text) if text else None for text in (arguments.fingers, arguments.normal))
-    orient(draft, thumb=arguments.thumb, along=along, normal=normal)
+    orient(draft, thumb=arguments.thumb, along=arguments.fingers, normal=arguments.normal)
     print("\n".join(draft.findings))
     if not arguments.yes:
-        _confirm()
+        if not sys.stdin.isatty():
+            raise ConfigError("not a terminal: --yes accepts the palm frame above, --fingers and --normal give another")
+        if input("Is this palm frame right? [y/N] ").strip().lower() not in ("y", "yes"):
+            raise ConfigError("give --fingers, --normal, --thumb or --palm")
     said = len(draft.findings)
     fit_links(draft, arguments.torque, arguments.speed)
     remarks = [f"Imported from {arguments.file.name} by dexsim import-hand.", *draft.findings]
     hand = load_hand(write_hand(draft, name, remarks, folder))
     for gap in _GAPS:
         posture, centre, gaps = find_grasp(hand, gap)
-        force = force_targets(hand, posture)
-        grasp: dict[str, Any] = {"posture": posture, "centre": centre, "finger_force": force}
+        # A finger's highest target is the thumb's strength, shared by the fingers that press at once, or the weakest
+        # finger's; the lowest is a quarter of it, as on the XHand, or what carries an object.
+        thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
+        highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
+        lowest = min(max(highest / 4, _CARRYING), highest)
+        grasp = {"posture": posture, "centre": centre, "finger_force": [lowest, highest]}
         path = write_hand(draft, name, remarks, folder, grasp)
         checks, passed = report(path)
         if not any("free of overlap" in line for line in checks):
             break
-    held = [
-        f"force        targets of {force[0]:.1f} to {force[1]:.1f} N a finger: what the thumb can oppose",
-        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in centre)} mm, {np.sum(is_near(gaps, gap))} of "
-        f"{len(gaps)} fingertips near it, the farthest {1e3 * gaps.max():.0f} mm away",
+    lines = [
+        *fit_lines(draft),
+        f"force        targets of {lowest:.1f} to {highest:.1f} N a finger: what the thumb can oppose",
+        f"grasp        ball at {', '.join(f'{1e3 * x:.0f}' for x in centre)} mm, fingertips "
+        f"{', '.join(f'{1e3 * x:.0f}' for x in gaps)} mm from it",
     ]
-    print("\n".join([*fit_lines(draft), *held, *draft.findings[said:], *checks]))
+    print("\n".join([*lines, *draft.findings[said:], *checks]))
     return path, passed
-
-
-def force_targets(hand: Hand, posture: np.ndarray) -> tuple[float, float]:
-    """A finger's target [N] at the commands 0 and 1. The highest is the thumb's strength in the grasp's posture [J],
-    shared by the fingers that press at once, or the weakest finger's; the lowest is a quarter of it, as on the XHand,
-    or what carries an object."""
-    thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
-    highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
-    return min(max(highest / 4, _CARRYING), highest), highest
-
-
-def parse_axis(text: str) -> np.ndarray:
-    """A direction [3] from +z, -x or 0,0.5,1.
-
-    Raises:
-      ConfigError: neither.
-    """
-    if match := re.fullmatch(r"([+-]?)([xyz])", text):
-        return (-1.0 if match[1] == "-" else 1.0) * np.eye(3)["xyz".index(match[2])]
-    try:
-        vector = np.array([float(x) for x in text.split(",")])
-        if vector.shape == (3,) and np.linalg.norm(vector) > 0:
-            return vector / np.linalg.norm(vector)
-    except ValueError:
-        pass
-    raise ConfigError(f"axis {text!r}: expected +x, -y, z or three numbers as 0,0.5,1")
-
-
-def _confirm() -> None:
-    """Ask whether the palm frame is right.
-
-    Raises:
-      ConfigError: it is not, or nobody is there to be asked.
-    """
-    if not sys.stdin.isatty():
-        raise ConfigError("not a terminal: --yes accepts the palm frame above, --fingers and --normal give another")
-    if input("Is this palm frame right? [y/N] ").strip().lower() not in ("y", "yes"):
-        raise ConfigError("give --fingers, --normal, --thumb or --palm")
 
 
 def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
@@ -179,7 +147,7 @@ def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
     """
     links = draft.links
     for name, chain in draft.fingers.items():
-        if not root_joint(draft, chain):
+        if not any(links[at].is_motor for at in chain):
             raise AssetError(f"finger {name!r} ({links[chain[-1]].name}) has no motor of its own")
     _assume_limits(draft, "torque", torque, TORQUES, _TORQUE, "Nm")
     _assume_limits(draft, "speed", speed, SPEEDS, _SPEED, "rad/s")
@@ -205,15 +173,14 @@ def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
 
 def _assume_limits(draft: Draft, what: str, given: float, span: tuple[float, float], usual: float, unit: str) -> None:
     """Set a limit of all motors to the `given` one, or implausible ones to the median of the others."""
-    values = {motor.joint: getattr(motor, what) for motor in draft.motors}
-    good = [value for value in values.values() if span[0] <= value <= span[1]]
+    values = [getattr(motor, what) for motor in draft.motors]
+    good = [value for value in values if span[0] <= value <= span[1]]
     best = given or (float(np.median(good)) if good else usual)
-    odd = {name: value for name, value in values.items() if given or value not in good}
-    for motor in draft.motors:
-        if motor.joint in odd:
-            setattr(motor, what, best)
+    odd = [value for value in values if value not in good]
+    for motor, value in zip(draft.motors, values, strict=True):
+        setattr(motor, what, best if given or value in odd else value)
     if odd and not given:
-        wrong = ", ".join(sorted({f"{value:g}" for value in odd.values() if value})) or "nothing"
+        wrong = ", ".join(sorted({f"{value:g}" for value in odd if value})) or "nothing"
         draft.findings.append(
             f"assumed      {what} {best:g} {unit} at {len(odd)} motors: the file says {wrong}; --{what} gives it"
         )
@@ -223,12 +190,12 @@ def _assume_masses(draft: Draft) -> None:
     """Links without a mass get that of water in their hull."""
     names = []
     for link in draft.links:
-        if link.mass < _LEAST_MASS and link.surface is not None:
+        if link.mass < LEAST_MASS and link.surface is not None:
             hull = link.surface.convex_hull
             hull.density = _DENSITY
             link.mass, link.centre, link.inertia = hull.mass, hull.center_mass, hull.moment_inertia
             names.append(link.name)
-        link.mass, link.inertia = max(link.mass, _LEAST_MASS), link.inertia + 1e-9 * np.eye(3)
+        link.mass, link.inertia = max(link.mass, LEAST_MASS), link.inertia + 1e-9 * np.eye(3)
     if names:
         draft.findings.append(f"assumed      mass by volume: {', '.join(names)}")
 
@@ -252,8 +219,7 @@ def _fit_pad(draft: Draft, at: int) -> Capsule:
     span = capsule.ends[1] - capsule.ends[0]
     if np.linalg.norm(span) > 0.01:
         capsule.ends[0] += 0.3 * span
-    capsule.radius = max(capsule.radius - _RUBBER, 0.6 * capsule.radius)
-    return capsule
+    return capsule._replace(radius=max(capsule.radius - _RUBBER, 0.6 * capsule.radius))
 
 
 def fit_lines(draft: Draft) -> list[str]:
@@ -263,13 +229,10 @@ def fit_lines(draft: Draft) -> list[str]:
         if link.capsule:
             radius, mean, most = (1e3 * x for x in (link.capsule.radius, *link.capsule.error))
             lines.append(f"  {link.name[:20]:21} {link.joint[:20]:21} {radius:8.1f} {mean:8.1f} {most:8.1f}")
-    assert draft.palm is not None, "fitted before"
-    sides, face = " x ".join(f"{2e3 * x:.0f}" for x in draft.palm.half), draft.palm.centre[0] + draft.palm.half[0]
-    beyond = f"{1e3 * draft.palm.largest_error:.0f} mm"
-    return [
-        *lines,
-        f"palm         box of {sides} mm, face at x = {1e3 * face:.0f} mm; the palm reaches {beyond} beyond it",
-    ]
+    centre, half, beyond = draft.palm
+    sides, face, beyond = " x ".join(f"{2e3 * x:.0f}" for x in half), 1e3 * (centre[0] + half[0]), 1e3 * beyond
+    lines.append(f"palm         box of {sides} mm, face at x = {face:.0f} mm; it reaches {beyond:.0f} mm beyond it")
+    return lines
 
 
 if __name__ == "__main__":

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import label
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
 _TIE = 1e-12  # m, triangles whose distances differ by less are equally near
-_SAME = 3**0.5 * 1e-7  # share of a mesh's size: corners nearer to each other than this are one
+_SAME = 1e-7  # share of a mesh's size to which corners are rounded before they are compared
 REPAIRS = ("none", "shell", "hull")
 """What `load_mesh` does with a mesh that is not closed."""
 _CELLS = 48  # of a shell's grid along the longest side
@@ -41,7 +39,7 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
     """Read a mesh file, or take a `trimesh.Trimesh` or a pair (vertices, faces), and check that it is closed, with
     outward triangles.
 
-    Corners at the same place, within 1.7e-7 of the mesh's size, become one: STL repeats them.
+    Corners at the same place, to about 1e-7 of the mesh's size, become one: STL repeats them.
 
     Args:
       source: path (any format that trimesh reads), mesh object or arrays.
@@ -53,26 +51,32 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
       AssetError: not readable, not finite, of no graspable size, open, non-manifold, with inconsistent or inward
         normals, or flat.
     """
-    vertices, faces, name = _read(source)
-    if not np.all(np.isfinite(vertices)):
-        raise AssetError(f"{name}: a vertex is not finite")
-    vertices = vertices * scale
-    size = float(np.ptp(vertices, axis=0).max())
+    import trimesh
+
+    name = str(source) if isinstance(source, (str, Path)) else "mesh"
+    try:
+        given = trimesh.load(source, force="mesh", process=False) if name != "mesh" else source
+    except Exception as error:  # each of trimesh's readers raises its own
+        raise AssetError(f"{name}: {' '.join(str(error).split()) or type(error).__name__}") from None
+    vertices, faces = given if isinstance(given, tuple) else (given.vertices, given.faces)
+    if not len(faces) or not np.all(np.isfinite(vertices)):
+        raise AssetError(f"{name}: {'a vertex is not finite' if len(faces) else 'no triangles'}")
+    size = float(scale * np.ptp(vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
         raise AssetError(
             f"{name}: {size:.3g} m across at scale {scale:g}, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
             "metres, pass scale=0.001 for a file in millimetres (ObjectConfig.mesh_unit)"
         )
-    mesh = make_mesh(name, *_merge(vertices, faces, _SAME * size))
+    mesh = _merged(make_mesh(name, scale * np.asarray(vertices, np.float64), faces))
     try:
         _check_closed(mesh, size)
     except AssetError as error:
         if repair == "none":
             raise
         closed = (_shell if repair == "shell" else _hull)(mesh)
-        mesh, given = make_mesh(f"{name} after repair", *_merge(*closed, _SAME * size)), mesh
+        mesh, open_one = _merged(make_mesh(f"{name} after repair", closed.vertices, closed.faces)), mesh
         _check_closed(mesh, size)
-        a, b = _points_on(given), _points_on(mesh)
+        a, b = _points_on(open_one), _points_on(mesh)
         away = 1e3 * max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
         print(f"{error}; its {repair} is {away:.2g} mm away", file=sys.stderr)
     return mesh
@@ -92,20 +96,8 @@ def fingerprint(mesh: Trimesh) -> str:
     return digest.hexdigest()
 
 
-def signed_distance(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact distance [P] m, negative inside, and its gradient [P, 3] (on the surface a face's normal), at points."""
-    points = np.asarray(points, np.float64).reshape(-1, 3)
-    nearest, normal = find_nearest(mesh, points)
-    apart = points - nearest
-    gap = np.linalg.norm(apart, axis=-1)
-    sign = np.where(np.sum(apart * normal, -1) < 0, -1.0, 1.0)
-    close = gap < 1e-9
-    gradient = np.where(close[:, None], normal, sign[:, None] * apart / np.where(close, 1.0, gap)[:, None])
-    return sign * gap, gradient
-
-
-def find_nearest(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest surface point [P, 3], and the normal [P, 3] of the triangle there that tells inside from outside.
+def signed_distance(mesh: Trimesh, points: np.ndarray) -> np.ndarray:
+    """Exact distance [P] m, negative inside, at points [P, 3] m.
 
     No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
     measure for each point.
@@ -116,22 +108,20 @@ def find_nearest(mesh: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
     middle = (corners.min(1) + corners.max(1)) / 2
     radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(1) + _TIE
-    nearest, normal = np.empty_like(points), np.empty_like(points)
-    step = max(1, BLOCK // len(corners))
+    distance, step = np.empty(len(points)), max(1, BLOCK // len(corners))
     for start in range(0, len(points), step):
         some = points[start : start + step]
         row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
-        candidate = trimesh.triangles.closest_point(corners[face], some[row])
-        apart = some[row] - candidate
+        apart = some[row] - trimesh.triangles.closest_point(corners[face], some[row])
         gap = np.linalg.norm(apart, axis=-1)
         least = np.full(len(some), np.inf)
         np.minimum.at(least, row, gap)
-        tied = gap <= least[row] + _TIE
-        off_plane = np.where(tied, np.abs(np.sum(apart * normals[face], -1)), -1.0)
-        order = np.lexsort((-off_plane, row))
-        first = order[np.searchsorted(row[order], np.arange(len(some)))]
-        nearest[start : start + step], normal[start : start + step] = candidate[first], normals[face[first]]
-    return nearest, normal
+        off_plane = np.sum(apart * normals[face], -1)
+        # The last triangle of each point is the one that tells inside from outside.
+        order = np.lexsort((np.where(gap <= least[row] + _TIE, np.abs(off_plane), -1.0), row))
+        last = order[np.searchsorted(row[order], np.arange(len(some)), side="right") - 1]
+        distance[start : start + step] = np.where(off_plane[last] < 0, -1.0, 1.0) * gap[last]
+    return distance
 
 
 def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
@@ -141,13 +131,11 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
       AssetError: they differ by more than a tenth and the error of sampling: the mesh cannot be signed.
     """
     low, high = mesh.bounds
-    distance, _ = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
+    distance = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
     inside, enclosed = np.sum(distance < 0), count * mesh.volume / np.prod(high - low)
     if abs(inside - enclosed) > 0.1 * enclosed + 4 * np.sqrt(enclosed):
-        raise AssetError(
-            f"{mesh.metadata['name']}: cannot be signed: {inside} of {count} random points are inside, expected "
-            f"{enclosed:.0f} by its volume; the surface cuts through itself or a part is inside out"
-        )
+        why = f"{inside} of {count} random points are inside, expected {enclosed:.0f}; it cuts through itself"
+        raise AssetError(f"{mesh.metadata['name']}: cannot be signed: {why}, or a part is inside out")
 
 
 def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -158,33 +146,11 @@ def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple
     return np.asarray(points), np.asarray(mesh.face_normals)[face]
 
 
-def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
-    """Vertices [V, 3], faces [T, 3] and the name of what `load_mesh` takes."""
-    name = "mesh"
-    if isinstance(source, (str, Path)):
-        import trimesh
-
-        name = str(source)
-        try:
-            source = trimesh.load(source, force="mesh", process=False)
-        except Exception as error:  # each of trimesh's readers raises its own
-            raise AssetError(f"{name}: {' '.join(str(error).split()) or type(error).__name__}") from None
-    vertices, faces = source if isinstance(source, tuple) else (source.vertices, source.faces)
-    if not len(faces):
-        raise AssetError(f"{name}: no triangles")
-    return np.asarray(vertices, np.float64), np.asarray(faces, np.int64), name
-
-
-def _merge(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices within `tolerance` m of each other become one; triangles that vanish by it are dropped."""
-    vertices, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    pairs = cKDTree(vertices).query_pairs(tolerance, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices), len(vertices)))
-    _, group = connected_components(graph, directed=False)
-    _, first = np.unique(group, return_index=True)
-    faces = group[inverse.reshape(-1)][faces]
-    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return vertices[first], faces[keep]
+def _merged(mesh: Trimesh) -> Trimesh:
+    """The mesh with vertices at one place made one, and without triangles that vanish by it."""
+    mesh.merge_vertices(digits_vertex=round(-np.log10(_SAME * np.ptp(mesh.vertices, axis=0).max())))
+    mesh.update_faces((np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all(1))
+    return mesh
 
 
 def _check_closed(mesh: Trimesh, size: float) -> None:
@@ -205,19 +171,20 @@ def _check_closed(mesh: Trimesh, size: float) -> None:
         raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
 
 
-def _hull(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
+def _hull(mesh: Trimesh) -> Trimesh:
     import trimesh
 
     # Nearly coplanar corners would leave slits between a hull's triangles.
     used = mesh.vertices[mesh.faces.ravel()]
     grid = 1e-4 * np.ptp(used, axis=0).max()
-    hull = trimesh.convex.convex_hull(np.unique(np.round(used / grid), axis=0) * grid)
-    return np.asarray(hull.vertices), np.asarray(hull.faces)
+    return trimesh.convex.convex_hull(np.unique(np.round(used / grid), axis=0) * grid)
 
 
-def _shell(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
+def _shell(mesh: Trimesh) -> Trimesh:
     """A closed surface round another one: all that cannot be reached from outside through gaps of less than two cells
     is inside. It is the boundary of cells, pulled to the surface."""
+    import trimesh
+
     points = _points_on(mesh)
     cell = np.ptp(points, axis=0).max() / _CELLS
     low = points.min(0) - 3 * cell
@@ -227,10 +194,11 @@ def _shell(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     regions, _ = label(tree.query(middles, distance_upper_bound=cell)[0].reshape(count) > cell)
     solid = regions != regions[0, 0, 0]
     _fill_diagonals(solid)
-    corners, triangles = _boundary(solid)
-    corners = low + cell * corners
-    _, nearest = tree.query(corners)
-    return points[nearest] + _CLOSE * (corners - points[nearest]), triangles
+    boundary = trimesh.voxel.ops.multibox(np.argwhere(solid), remove_internal_faces=True)
+    corners = low + cell * (boundary.vertices + 0.5)
+    nearest = points[tree.query(corners)[1]]
+    boundary.vertices = nearest + _CLOSE * (corners - nearest)
+    return boundary
 
 
 def _fill_diagonals(solid: np.ndarray) -> None:
@@ -245,22 +213,6 @@ def _fill_diagonals(solid: np.ndarray) -> None:
                 bad = full[0] & full[1] & ~empty[0] & ~empty[1]
                 changed |= bool(bad.any())
                 empty[0][bad] = True
-
-
-def _boundary(solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [V, 3], in cells, and outward triangles [T, 3] of the faces between full and empty cells."""
-    shape, quads = np.array(solid.shape) + 1, []
-    for axis in range(3):
-        across, along = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
-        step = np.diff(solid.astype(np.int8), axis=axis)
-        rings = {-1: (0 * across, across, across + along, along), 1: (0 * across, along, across + along, across)}
-        for sign, ring in rings.items():
-            start = np.argwhere(step == sign) + np.eye(3, dtype=int)[axis]
-            quads.append(np.stack([np.ravel_multi_index((start + corner).T, shape) for corner in ring], -1))
-    quad = np.concatenate(quads)
-    used, inverse = np.unique(quad, return_inverse=True)
-    quad = inverse.reshape(quad.shape)
-    return np.stack(np.unravel_index(used, shape), -1), np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
 
 
 def _points_on(mesh: Trimesh) -> np.ndarray:

@@ -12,14 +12,14 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.hand.vendor import Draft, Link
 
-FLEXION = 0.7
-"""Cosine to the axis of a finger's last joint above which another joint flexes, too."""
+_FLEXION = 0.7  # cosine to the axis of a finger's last joint above which another joint flexes, too
 _NAMES = ("index", "middle", "ring", "pinky", "sixth")
 _THUMB = re.compile(r"thumb|(^|[^a-z])th([^a-z]|[jmdpb]|$)", re.IGNORECASE)
+Direction = tuple[float, float, float]
 _SNAP = np.cos(np.radians(10.0))  # a frame this near to the file's axes is meant to be along them
 
 
-def orient(draft: Draft, *, thumb: str = "", along: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
+def orient(draft: Draft, *, thumb: str = "", along: Direction | None = None, normal: Direction | None = None) -> None:
     """Find fingers, palm frame, signs and side, and turn the links into them.
 
     Args:
@@ -33,14 +33,14 @@ def orient(draft: Draft, *, thumb: str = "", along: np.ndarray | None = None, no
     parents = {link.parent for link in links}
     chains = [_chain(links, at) for at in range(1, len(links)) if at not in parents]
     if not 2 <= len(chains) <= 6:
-        raise AssetError(
-            f"{draft.name}: expected 2 to 6 fingers, got {len(chains)} chains of hinges; --palm BODY chooses a "
-            "hand, --freeze JOINT fixes a hinge that is no finger's"
-        )
+        raise AssetError(f"{draft.name}: expected 2 to 6 fingers, got {len(chains)}; see --palm BODY, --freeze JOINT")
     first = chains.pop(_find_thumb(draft, chains, thumb))
     rotation = _find_frame(links, chains, along, normal)
     for link in links:
-        _turn(link, rotation)
+        link.axis, link.anchor, link.centre = (rotation @ vector for vector in (link.axis, link.anchor, link.centre))
+        link.inertia = rotation @ link.inertia @ rotation.T
+        if link.surface is not None:
+            link.surface.vertices = np.asarray(link.surface.vertices) @ rotation.T
     chains.sort(key=lambda chain: _aside(links, chain))
     thumb_side = _aside(links, first) - np.mean([_aside(links, chain) for chain in chains])
     if thumb_side > 0:
@@ -49,12 +49,12 @@ def orient(draft: Draft, *, thumb: str = "", along: np.ndarray | None = None, no
     draft.side, other = ("left", "right") if thumb_side < 0 else ("right", "left")
     wrong = _close_positive(draft)
     fingers = ", ".join(f"{name} ({links[chain[-1]].name})" for name, chain in draft.fingers.items())
+    facing, _, upward = (" ".join(f"{x:.3g}" for x in axis.round(3) + 0.0) for axis in rotation)
     draft.findings += [
         f"{draft.name}: {len(draft.motors)} motors, {len(links) - 1 - len(draft.motors)} joints that follow them",
         f"palm         body {links[0].name}",
         f"fingers      {fingers}",
-        f"palm frame   fingers along {_axis(rotation[2])} of the file's body, palm facing {_axis(rotation[0])}; "
-        f"a {draft.side} hand",
+        f"palm frame   in the file's axes fingers point along {upward}, the palm faces {facing}; a {draft.side} hand",
     ]
     if wrong:
         draft.findings.append(f"reversed     {', '.join(wrong)}: positive opens in the file, closes here")
@@ -82,7 +82,7 @@ def tip_of(links: Sequence[Link], chain: Sequence[int]) -> np.ndarray:
 def flexion_links(links: Sequence[Link], chain: Sequence[int]) -> list[int]:
     """Links of a chain whose hinges are parallel to its last one's."""
     last = links[chain[-1]].axis
-    return [at for at in chain if abs(links[at].axis @ last) > FLEXION]
+    return [at for at in chain if abs(links[at].axis @ last) > _FLEXION]
 
 
 def _aside(links: Sequence[Link], chain: Sequence[int]) -> float:
@@ -125,46 +125,32 @@ def _find_thumb(draft: Draft, chains: list[list[int]], given: str) -> int:
 
 
 def _find_frame(
-    links: list[Link], fingers: list[list[int]], along: np.ndarray | None, normal: np.ndarray | None
+    links: list[Link], fingers: list[list[int]], along: Direction | None, normal: Direction | None
 ) -> np.ndarray:
     """The palm's axes [3, 3] in rows, from the fingers but the thumb."""
     axes = np.array([links[chain[-1]].axis for chain in fingers])
     values, vectors = np.linalg.eigh(axes.T @ axes)
-    across = vectors[:, -1]
+    across, given = vectors[:, -1], along is not None or normal is not None
     if values[-1] < 0.8 * len(fingers) and (along is None or normal is None):
-        raise AssetError(
-            "the fingers' last joints are not parallel, so no palm side is found: give --fingers and --normal, axes of "
-            "the file along which the fingers point and the palm faces, as +z or 0,0.5,1"
-        )
+        raise AssetError("no palm side found, the fingers' last joints are not parallel: give --fingers and --normal")
     arms = [_unit(tip_of(links, chain) - links[chain[0]].anchor) for chain in fingers]
-    z = np.mean(arms, 0) if along is None else along
+    z = _unit(np.mean(arms, 0) if along is None else np.asarray(along))
+    x = np.asarray(normal)
     if normal is None:
         z = _unit(z - across * (across @ z))
-        x = _unit(np.cross(across, z))
+        x = np.cross(across, z)
         x = x * np.sign(x @ sum(_bend(links, chain) for chain in fingers))
-    else:
-        x = normal
-    z = _unit(z)
     x = _unit(x - z * (z @ x))
     rotation = np.stack([x, np.cross(z, x), z])
     rounded = np.round(rotation)
-    given = along is not None or normal is not None
-    if not given and np.all(np.abs(rotation[rounded != 0]) > _SNAP) and np.linalg.det(rounded) == 1:
-        return rounded
-    return rotation
+    snaps = np.all(np.abs(rotation[rounded != 0]) > _SNAP) and np.linalg.det(rounded) == 1
+    return rounded if snaps and not given else rotation
 
 
 def _bend(links: Sequence[Link], chain: Sequence[int]) -> np.ndarray:
     """Which way [3] a finger's tip moves when it bends: farther to the front than to the back."""
     tip, flexing = tip_of(links, chain), [links[at] for at in flexion_links(links, chain)]
     return np.sum([(link.low + link.high) * np.cross(link.axis, tip - link.anchor) for link in flexing], 0)
-
-
-def _turn(link: Link, rotation: np.ndarray) -> None:
-    link.axis, link.anchor, link.centre = rotation @ link.axis, rotation @ link.anchor, rotation @ link.centre
-    link.inertia = rotation @ link.inertia @ rotation.T
-    if link.surface is not None:
-        link.surface.vertices = np.asarray(link.surface.vertices) @ rotation.T
 
 
 def _close_positive(draft: Draft) -> list[str]:
@@ -183,13 +169,6 @@ def _close_positive(draft: Draft) -> list[str]:
         if sign < 0:
             link.low, link.high = -link.high, -link.low
     return sorted(wrong)
-
-
-def _axis(vector: np.ndarray) -> str:
-    at = int(np.argmax(np.abs(vector)))
-    if abs(vector[at]) > 0.9999:
-        return f"{'-' if vector[at] < 0 else '+'}{'xyz'[at]}"
-    return ",".join(f"{x:.3f}" for x in vector)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

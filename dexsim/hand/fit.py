@@ -1,18 +1,18 @@
 """Primitives in place of a link's meshes: a capsule for a link, a box and its face for a palm."""
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import binned_statistic_2d
 
+from dexsim.geometry.mesh import sample_surface
+
 _SAMPLES = 600
 _CELL = 5e-3  # m, of the grid on which a palm's face is measured
 
 
-@dataclasses.dataclass(eq=False, kw_only=True)
-class Capsule:
+class Capsule(NamedTuple):
     """A segment [2, 3] m and a radius m; `error`: how far the link's convex hull is from it, mean and largest, m."""
 
     ends: np.ndarray
@@ -20,19 +20,18 @@ class Capsule:
     error: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclasses.dataclass(eq=False, kw_only=True)
-class PalmBox:
+class PalmBox(NamedTuple):
     """A box along the palm's axes: its middle and half-extents [3] m. Its face is at the largest x."""
 
     centre: np.ndarray
     half: np.ndarray
-    largest_error: float  # m, how far the palm reaches beyond it
+    beyond: float  # m, how far the palm reaches beyond it
 
 
 def fit_capsule(surface: Any, along: np.ndarray) -> Capsule:
     """The capsule with the least squared distance to samples of a link's convex hull; objects meet nothing but the
     hull. It begins from an axis [3] `along` the link."""
-    points = _sample(surface.convex_hull, _SAMPLES)
+    points = sample_surface(surface.convex_hull, _SAMPLES, np.random.default_rng(0))[0]
     middle = (points.max(0) + points.min(0)) / 2
     spread = (points - middle) @ along
     radius = np.median(np.linalg.norm(points - middle - np.outer(spread, along), axis=1))
@@ -52,14 +51,14 @@ def fit_capsule(surface: Any, along: np.ndarray) -> Capsule:
 
 def fit_palm(surface: Any) -> PalmBox:
     """The box of a palm. Its face is where most of the front is: mounts of thumb and fingers stand out of it."""
-    points = _sample(surface, 40 * _SAMPLES)
+    points = sample_surface(surface, 40 * _SAMPLES, np.random.default_rng(0))[0]
     low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
     bins = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low[1:], high[1:], strict=True)]
     front = binned_statistic_2d(points[:, 1], points[:, 2], points[:, 0], "max", bins).statistic
     high[0] = np.nanpercentile(front, 70)
     half = np.maximum((high - low) / 2, 2e-3)
     beyond = np.maximum(low - points.min(0), points.max(0) - high).max()
-    return PalmBox(centre=(low + high) / 2, half=half, largest_error=float(beyond))
+    return PalmBox((low + high) / 2, half, float(beyond))
 
 
 def segment_distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -67,10 +66,3 @@ def segment_distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.nda
     arm, span = points - a, b - a
     share = np.clip(np.sum(arm * span, -1) / np.maximum(np.sum(span * span, -1), 1e-12), 0, 1)
     return np.linalg.norm(arm - share[..., None] * span, axis=-1)
-
-
-def _sample(surface: Any, count: int) -> np.ndarray:
-    """Points [count, 3] on a surface, uniform by area, the same ones every time."""
-    import trimesh
-
-    return np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0])

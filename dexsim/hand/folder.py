@@ -43,12 +43,6 @@ def write_hand(
     return path
 
 
-def root_joint(draft: Draft, chain: list[int]) -> str:
-    """The motor whose torque represents a finger: its first one that flexes, or else its first; empty for none."""
-    order = (*flexion_links(draft.links, chain), *chain)
-    return next((draft.links[at].joint for at in order if draft.links[at].is_motor), "")
-
-
 def _mjcf(draft: Draft, name: str) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
@@ -64,8 +58,11 @@ def _mjcf(draft: Draft, name: str) -> mujoco.MjSpec:
         if at:
             _add_hinge(spec, body, link)
             _add_capsule(body, link, tips.get(at, ""))
-        else:
-            _add_palm(body, draft)
+    palm, kinds, (centre, half, _) = bodies[0], mujoco.mjtGeom, draft.palm
+    palm.add_geom(name="palm_box", type=kinds.mjGEOM_BOX, pos=centre, size=half, rgba=_TOUCH, group=3)
+    # Its face is a half-space for objects that boxes do not meet in closed form.
+    face = {"pos": centre + [half[0], 0, 0], "quat": [0.5**0.5, 0, 0.5**0.5, 0], "size": [half[2], half[1], 0.001]}
+    palm.add_geom(name="palm_face", type=kinds.mjGEOM_PLANE, rgba=[0] * 4, group=3, **face)
     thumb, *fingers = draft.fingers
     for finger in fingers:
         spec.add_pair(geomname1=f"{thumb}_pad", geomname2=f"{finger}_pad", condim=1)
@@ -73,29 +70,13 @@ def _mjcf(draft: Draft, name: str) -> mujoco.MjSpec:
 
 
 def _add_hinge(spec: mujoco.MjSpec, body: Any, link: Link) -> None:
-    follows = bool(link.leader)
-    hinge = body.add_joint(
-        name=link.joint, axis=link.axis, range=[link.low, link.high], damping=0.005 if follows else 0.02
-    )
-    hinge.limited, hinge.armature = mujoco.mjtLimited.mjLIMITED_TRUE, 0.0002 if follows else 0.001
-    if not follows:
-        hinge.actfrclimited, hinge.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-link.torque, link.torque]
-        return
-    data = np.zeros(mujoco.mjNEQDATA)
-    data[:2] = link.offset, link.ratio
-    names = {"name1": link.joint, "name2": link.leader}
-    of_joints = {"type": mujoco.mjtEq.mjEQ_JOINT, "objtype": mujoco.mjtObj.mjOBJ_JOINT}
-    spec.add_equality(**of_joints, **names, data=data, **_COUPLING)
-
-
-def _add_palm(body: Any, draft: Draft) -> None:
-    """The palm's box, and its face as a half-space for objects that boxes do not meet in closed form."""
-    assert draft.palm is not None, "fitted before"
-    kinds, centre, half = mujoco.mjtGeom, draft.palm.centre, draft.palm.half
-    body.add_geom(name="palm_box", type=kinds.mjGEOM_BOX, pos=centre, size=half, rgba=_TOUCH, group=3)
-    face, quat = centre + [half[0], 0, 0], [0.5**0.5, 0, 0.5**0.5, 0]
-    size = [half[2], half[1], 0.001]
-    body.add_geom(name="palm_face", type=kinds.mjGEOM_PLANE, pos=face, quat=quat, size=size, rgba=[0] * 4, group=3)
+    damping, armature, stall = (0.005, 0.0002, 0.0) if link.leader else (0.02, 0.001, link.torque)
+    hinge = body.add_joint(name=link.joint, axis=link.axis, range=[link.low, link.high], damping=damping)
+    hinge.armature, hinge.actfrcrange = armature, [-stall, stall]
+    if link.leader:
+        polynomial = np.array([link.offset, link.ratio, *[0.0] * (mujoco.mjNEQDATA - 2)])
+        of_joints = {"type": mujoco.mjtEq.mjEQ_JOINT, "objtype": mujoco.mjtObj.mjOBJ_JOINT}
+        spec.add_equality(name1=link.joint, name2=link.leader, data=polynomial, **of_joints, **_COUPLING)
 
 
 def _add_capsule(body: Any, link: Link, tip: str) -> None:
@@ -142,11 +123,13 @@ def _toml(draft: Draft, name: str, grasp: Mapping[str, Iterable[float]]) -> list
     for finger, chain in draft.fingers.items():
         last = links[chain[-1]]
         facing = np.cross(last.axis, tip_of(links, chain) - last.anchor)
+        # Its first motor that flexes represents a finger, or else its first.
+        root = next(links[at].joint for at in (*flexion_links(links, chain), *chain) if links[at].is_motor)
         lines += [
             "\n[[fingers]]",
             f'name = "{finger}"',
             f'tip = "{finger}_tip"',
-            f'root_joint = "{root_joint(draft, chain)}"',
+            f'root_joint = "{root}"',
             f'pad = "{finger}_pad"',
             f"facing = {_row(facing / np.linalg.norm(facing))}",
         ]

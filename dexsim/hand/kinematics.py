@@ -68,6 +68,11 @@ def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
     return rotations.rotate(pose.tip_rotation[:, None], jnp.asarray(hand.taxel_normal))
 
 
+def open_hand(hand: Hand) -> np.ndarray:
+    """Joint angles [J] rad nearest to 0 that the ranges allow."""
+    return np.clip(np.float32(0.0), hand.joint_lower, hand.joint_upper)
+
+
 def finger_bodies(hand: Hand, finger: int) -> list[int]:
     """Bodies from a fingertip's to the palm's."""
     bodies = [int(hand.tip_body[finger])]

@@ -95,7 +95,8 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
     """The taxels [F, N, 7] of a layout file: position, normal, area. Every finger must have columns * rows of them.
 
     Raises:
-      AssetError: missing or broken file, with the line.
+      AssetError: a broken file, with the line.
+      OSError: it cannot be read.
     """
     columns, rows = grid
     table = np.full((len(fingers), columns, rows, 7), np.nan, np.float32)
@@ -116,14 +117,9 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
                 if not abs(np.linalg.norm(values[3:6]) - 1) <= 0.01 or not _SMALLEST <= values[6] <= _LARGEST:
                     raise ValueError(f"the normal must be of length 1, the area above 0 and at most {_LARGEST:g} m^2")
                 table[place] = values
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, TypeError, ValueError, csv.Error) as error:
+    except (TypeError, ValueError, csv.Error) as error:
         raise AssetError(f"{path}:{line}: {error}") from None
-    count = np.sum(np.isfinite(table).all(-1), axis=(1, 2))
-    if np.any(count != columns * rows):
-        worst = int(np.argmin(count))
-        raise AssetError(
-            f"{path}: finger {fingers[worst]!r} has {count[worst]} valid taxels, expected {columns * rows}"
-        )
+    for finger, count in zip(fingers, np.isfinite(table).all(-1).sum((1, 2)), strict=True):
+        if count != columns * rows:
+            raise AssetError(f"{path}: finger {finger!r} has {count} valid taxels, expected {columns * rows}")
     return table.reshape(len(fingers), -1, 7)

@@ -1,7 +1,6 @@
 """The hand, read from an MJCF, a taxel layout and a short TOML: nothing in the library but the files under
 `assets/hand/` knows which hand it is."""
 
-import contextlib
 import dataclasses
 import hashlib
 import re
@@ -89,23 +88,17 @@ class HandFile(Config):
 
 def find_hand(name: str | Path | None) -> Path:
     """The TOML of a hand that is named by a path, or by the name of a shipped one; None for the default one."""
-    if not name:
-        return asset_path(f"hand/{DEFAULT}.toml")
-    text = str(name)
-    if re.fullmatch(r"\w+", text) and not Path(text).is_file():  # a folder of that name is no hand
-        for place in (f"hand/{text}.toml", f"hand/{text}/{text}.toml"):
-            with contextlib.suppress(AssetError):
-                return asset_path(place)
-        what = "a folder" if Path(text).is_dir() else "no such file"
-        raise AssetError(f"hand {text!r}: {what}, and no shipped hand has that name")
-    return Path(text)
+    text = str(name or DEFAULT)
+    if not re.fullmatch(r"\w+", text) or Path(text).is_file():
+        return Path(text)
+    if text not in shipped_hands():  # a folder of that name is no hand
+        raise AssetError(f"hand {text!r}: no such file, and no shipped hand has that name")
+    return shipped_hands()[text]
 
 
-def shipped_name(path: Path) -> str:
-    """The name of the shipped hand whose TOML this is; empty for others."""
-    with contextlib.suppress(AssetError):
-        return path.stem if path.resolve() == find_hand(path.stem).resolve() else ""
-    return ""
+def shipped_hands() -> dict[str, Path]:
+    """The TOMLs of the shipped hands by their names."""
+    return {path.stem: path for path in sorted(asset_path("hand").rglob("*.toml"))}
 
 
 def read_mjcf(path: Path) -> bytes:
@@ -150,7 +143,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
     """
     file = find_hand(path)
     try:
-        return _load(file, shipped_name(file) or str(path))
+        return _load(file, next((name for name, own in shipped_hands().items() if own == file.resolve()), str(path)))
     except FileNotFoundError as error:
         raise AssetError(f"{error.filename}: no such file") from None
     except KeyError as error:  # of MuJoCo: a name that the model lacks, and those that it has
@@ -175,9 +168,8 @@ def _load(path: Path, source: str) -> Hand:
     _check_joints(model, table, joints, len(followers))
     palm = model.body(table.palm).id
     bodies = [b for b in range(1, model.nbody) if is_below(model.body_parentid, b, palm)]
-    if unnamed := [b for b in bodies if not model.body(b).name]:
-        parent = model.body(model.body_parentid[unnamed[0]]).name
-        raise ConfigError(f"{table.model}: a body of {parent!r} has no name: every link from the palm on needs one")
+    if not all(model.body(b).name for b in bodies):
+        raise ConfigError(f"{table.model}: a body below {table.palm!r} has no name: every link needs one")
     row = {body: i for i, body in enumerate(bodies)}
     at = _hinges_of_bodies(model, palm, row)
     has = at >= 0
@@ -247,12 +239,10 @@ def read_coupling(model: Any, index: int) -> tuple[int, int, float, float] | Non
     first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
     if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or not model.eq_active0[index]:
         return None
-    a0, ratio, *higher = model.eq_data[index, :5]
+    a0, ratio, *higher = polycoef = model.eq_data[index, :5].tolist()
     if any(higher) or not ratio:
-        raise ConfigError(
-            f"joint {model.joint(first).name!r} follows {model.joint(second).name!r} by the polycoef "
-            f"{model.eq_data[index, :5].tolist()}; only an offset and a ratio are supported: a0 a1 0 0 0"
-        )
+        name, leader = (model.joint(joint).name for joint in (first, second))
+        raise ConfigError(f"joint {name!r} follows {leader!r} by the polycoef {polycoef}, expected a0 a1 0 0 0")
     reference = model.qpos0[model.jnt_qposadr[[first, second]]]
     return first, second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
 
@@ -266,8 +256,7 @@ def _read_followers(model: Any, motors: list[int]) -> dict[int, tuple[int, float
         raise ConfigError(f"tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
     followers: dict[int, tuple[int, float, float]] = {}
     for index in range(model.neq):
-        coupling = read_coupling(model, index)
-        if coupling is None:
+        if (coupling := read_coupling(model, index)) is None:
             name = model.equality(index).name or f"#{index}"
             raise ConfigError(f"equality {name!r}: only active ones of two joints are supported")
         first, second, ratio, offset = coupling
@@ -280,10 +269,8 @@ def _read_followers(model: Any, motors: list[int]) -> dict[int, tuple[int, float
         reach = np.sort(ratio * model.jnt_range[second] + offset)
         low, high = model.jnt_range[first]
         if model.jnt_limited[first] and (reach[0] < low - _SLACK or reach[1] > high + _SLACK):
-            raise ConfigError(
-                f"joint {name!r} has the range {low:.4g} to {high:.4g} rad, and {leader!r} takes it from "
-                f"{reach[0]:.4g} to {reach[1]:.4g}"
-            )
+            taken = f"{leader!r} takes it from {reach[0]:.4g} to {reach[1]:.4g}"
+            raise ConfigError(f"joint {name!r} has the range {low:.4g} to {high:.4g} rad, and {taken}")
     return followers
 
 
@@ -296,25 +283,17 @@ def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int
     hinges = np.all(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     if len(joints) != motors or len(set(joints)) != motors or not hinges:
         raise ConfigError(
-            f"joints lists {len(set(joints))} of the {motors} joints of {table.model}; every joint must be "
-            "a hinge, and be listed once or follow one by an equality"
+            f"joints lists {len(set(joints))} of the {motors} joints that follow none, expected all: hinges"
         )
-    for name, values in {
-        "speed_limits": table.speed_limits,
-        "gains": table.gains or joints,
-        "grasp.posture": table.grasp.posture or joints,
-        "rotate.posture": table.rotate.posture or joints,
-    }.items():
-        if len(values) != len(joints):
+    postures = {"grasp.posture": table.grasp.posture, "rotate.posture": table.rotate.posture}
+    for name, values in {"speed_limits": table.speed_limits, "gains": table.gains, **postures}.items():
+        if len(values) != len(joints) and (values or name == "speed_limits"):
             raise ConfigError(f"{len(values)} {name} for {len(joints)} joints")
     for place, (name, joint) in enumerate(zip(table.joints, joints, strict=True)):
         (low, high), torque = model.jnt_range[joint], model.jnt_actfrcrange[joint]
         if not model.jnt_limited[joint] or torque[1] <= 0 or not np.isclose(torque[0], -torque[1]):
-            raise ConfigError(
-                f"{table.model}: joint {name!r} needs a range, and an actuatorfrcrange from -T to T, its stall torque; "
-                f"got {torque[0]:g} to {torque[1]:g} Nm"
-            )
-        for angle in (posture[place] for posture in (table.grasp.posture, table.rotate.posture) if posture):
+            raise ConfigError(f"joint {name!r} needs a range, and its stall torque as actuatorfrcrange, got {torque}")
+        for angle in (posture[place] for posture in postures.values() if posture):
             if not low - _SLACK <= angle <= high + _SLACK:
                 span = f"{low:.4g} to {high:.4g} rad"
                 raise ConfigError(f"posture: {angle:g} rad of {name!r} is outside of its range in the MJCF, {span}")
@@ -323,12 +302,9 @@ def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int
 def _hinges_of_bodies(model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
     """The model's joint [B] that moves each body; -1 for none."""
     hinges = np.full(len(row), -1)
-    for joint in range(model.njnt):
-        body = int(model.jnt_bodyid[joint])
+    for joint, body in enumerate(model.jnt_bodyid.tolist()):
         if body not in row or body == palm or hinges[row[body]] >= 0:
-            raise ConfigError(
-                f"joint {model.joint(joint).name!r} must be the only joint of a body below {model.body(palm).name!r}"
-            )
+            raise ConfigError(f"joint {model.joint(joint).name!r} must be the only joint of a body below the palm")
         hinges[row[body]] = joint
     return hinges
 
@@ -339,10 +315,9 @@ def _find_tips(model: Any, table: HandFile, row: dict[int, int]) -> list[int]:
     for finger in table.fingers:
         tip, root = model.site(finger.tip).id, model.joint(finger.root_joint).id
         body, name = int(model.site_bodyid[tip]), f"tip {finger.tip!r}"
-        if body not in row:
-            raise ConfigError(f"{name} is on no body of {table.palm!r}")
-        if body in model.site_bodyid[tips]:  # the physics gives the force on a link, not where on it
-            raise ConfigError(f"{name} is on {model.body(body).name!r}, as another finger's tip")
+        # The physics gives the force on a link, not where on it.
+        if body not in row or body in model.site_bodyid[tips]:
+            raise ConfigError(f"{name} is on {model.body(body).name!r}, expected a link of {table.palm!r} of its own")
         if finger.root_joint not in table.joints or not is_below(model.body_parentid, body, model.jnt_bodyid[root]):
             raise ConfigError(f"root_joint {finger.root_joint!r} is not among joints, or does not move {name}")
         tips.append(tip)
@@ -363,16 +338,11 @@ def _lay_taxels(table: HandFile, geoms: tuple[Geom, ...], tip_body: np.ndarray) 
             if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(facing):
                 raise ConfigError(f"facing = {finger.facing}: expected a direction across the pad {pad.name!r}")
             across /= np.linalg.norm(across)
-            rows = lay_taxels(
-                table.taxel_grid,
-                pitch=table.taxel_pitch or 0.0,
-                radius=float(pad.size[0]),
-                half_length=float(pad.size[1]),
-                position=pad.position,
-                rotation=np.stack([across, np.cross(along, across), along], -1),
-            )
-        taxels.append(rows)
-    return np.asarray(taxels, np.float32)
+            turn, (radius, half_length, _) = np.stack([across, np.cross(along, across), along], -1), pad.size.tolist()
+            pose = {"position": pad.position, "rotation": turn}
+            capsule = {"radius": radius, "half_length": half_length}
+            taxels.append(lay_taxels(table.taxel_grid, pitch=table.taxel_pitch or 0.0, **capsule, **pose))
+    return _f32(taxels)
 
 
 def _f32(values) -> np.ndarray:
@@ -403,10 +373,8 @@ def _read_geoms(model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
         if body not in row:
             continue
         if kind is None and touches:
-            raise ConfigError(
-                f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r} is no primitive and "
-                "touches: meshes are drawn only (contype and conaffinity 0); use capsules, spheres or boxes"
-            )
+            which = f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r}"
+            raise ConfigError(f"{which} is no primitive and touches: meshes need contype and conaffinity 0")
         if kind is not None:
             size, position, rotation = model.geom_size[g], model.geom_pos[g], _matrix(model.geom_quat[g])
             geoms.append(Geom(model.geom(g).name, kind, row[body], _f32(size), _f32(position), _f32(rotation), touches))

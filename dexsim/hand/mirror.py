@@ -6,15 +6,12 @@ The palm's frame and every link's are reflected in their planes y = 0. Joint axe
 turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
 """
 
-import csv
 import dataclasses
 import functools
-import io
 import re
 import shutil
 import tomllib
 from collections.abc import Iterator
-from itertools import groupby
 from pathlib import Path
 from typing import TypeVar, cast
 from xml.etree import ElementTree
@@ -95,12 +92,6 @@ def swap_sides(text: str) -> str:
     return re.sub(r"(?<![a-z])(right|left)(?![a-z])", other, text, flags=re.IGNORECASE)
 
 
-def mirror_name(name: str, side: str) -> str:
-    """The name of a mirror image that is a hand of this side."""
-    swapped = swap_sides(name)
-    return swapped if swapped != name else f"{name}_{side}"
-
-
 def mirror_toml(text: str, stem: str) -> str:
     """The mirror image's TOML, whose files are `stem`.xml and `stem`_taxels.csv."""
     table = tomllib.loads(text)
@@ -129,15 +120,13 @@ def mirror_mjcf(model: ElementTree.Element) -> None:
     for tag, name, value in (("joint", "axis", "0 0 1"), ("mesh", "scale", "1 1 1")):
         if model.find(f".//{tag}") is not None:
             default = first.find(tag)
-            if default is None:
-                default = ElementTree.SubElement(first, tag)
+            default = ElementTree.SubElement(first, tag) if default is None else default
             default.attrib.setdefault(name, value)
     for element in model.iter():
         for name, value in element.attrib.items():
             which = (1,) if (element.tag, name) == ("mesh", "scale") else signs.get(name)
             if which:
-                numbers = value.split()
-                value = " ".join(_negate(n) if i in which else n for i, n in enumerate(numbers))
+                value = " ".join(_negate(n) if i in which else n for i, n in enumerate(value.split()))
             elif name not in ("file", *_FOLDERS):
                 value = swap_sides(value)
             element.set(name, value)
@@ -149,20 +138,14 @@ def mirror_taxels(text: str) -> str:
     A lattice that is its own mirror image stays as it is, index by index: it is the same part on either hand, and its
     columns run the same way round the finger.
     """
-    head, *rows = csv.reader(io.StringIO(text))
-    y, normal_y, at = head.index("y"), head.index("ny"), [head.index(name) for name in "xyz"]
-    mirrored: list[list[str]] = []
-    for _, group in groupby(rows, key=lambda row: row[head.index("finger")]):
-        taxels = list(group)
-        place = np.array([[float(row[i]) for i in at] for row in taxels])
-        apart = np.abs(place[:, None] - place * POLAR).max(-1).min(1)
-        if apart.max() > _SAME:
+    head, *rows = [line.split(",") for line in text.splitlines() if line]
+    for finger in {row[0] for row in rows}:
+        taxels = [row for row in rows if row[0] == finger]
+        place = np.array([row[3:6] for row in taxels], float)
+        if np.abs(place[:, None] - place * POLAR).max(-1).min(1).max() > _SAME:
             for row in taxels:
-                row[y], row[normal_y] = _negate(row[y]), _negate(row[normal_y])
-        mirrored += taxels
-    table = io.StringIO()
-    csv.writer(table, lineterminator="\n").writerows([head, *mirrored])
-    return table.getvalue()
+                row[4], row[7] = _negate(row[4]), _negate(row[7])  # y, ny
+    return "".join(",".join(row) + "\n" for row in (head, *rows))
 
 
 def write_mirror(path: Path, folder: Path) -> Path:
@@ -176,20 +159,19 @@ def write_mirror(path: Path, folder: Path) -> Path:
       AssetError: a file of the hand is missing or broken, or the new one exists.
     """
     hand = load_hand(path)
-    stem = mirror_name(path.stem, OTHER[hand.side])
+    stem = swap_sides(path.stem)
+    stem = f"{stem}_{OTHER[hand.side]}" if stem == path.stem else stem
     toml = folder / f"{stem}.toml"
     if toml.exists():
         raise AssetError(f"{toml}: exists; give another folder with --out")
     text = path.read_text()
     model = ElementTree.fromstring(read_mjcf(hand.model_path))
-    files = dict(_gather_files(model, hand.model_path.parent))
-    mirror_mjcf(model)
-    comment = f" Mirror image of {hand.model_path.name} in the plane y = 0. "
-    model.insert(0, ElementTree.Comment(comment))
-    ElementTree.indent(model)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, source in files.items():
+    for name, source in _gather_files(model, hand.model_path.parent):
         shutil.copyfile(source, folder / name)
+    mirror_mjcf(model)
+    model.insert(0, ElementTree.Comment(f" Mirror image of {hand.model_path.name} in the plane y = 0. "))
+    ElementTree.indent(model)
     write_atomic(folder / f"{stem}.xml", [ElementTree.tostring(model) + b"\n"])
     if taxels := tomllib.loads(text).get("taxels"):
         write_atomic(folder / f"{stem}_taxels.csv", [mirror_taxels((path.parent / taxels).read_text()).encode()])

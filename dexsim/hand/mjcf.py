@@ -24,7 +24,9 @@ def read_mjcf(hand: Hand) -> mujoco.MjSpec:
     # `alt` (euler and the like) would outweigh the quaternion.
     root.pos, root.quat, root.alt.type = [0, 0, 0], [1, 0, 0, 0], mujoco.mjtOrientation.mjORIENTATION_QUAT
     model = spec.compile()
-    frame, palm = _poses(model, root.name, hand.palm)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)  # all joints are at their references
+    frame, palm = (_pose(data.body(name)) for name in (root.name, hand.palm))
     if not np.array_equal(palm, np.eye(4)):
         # The root is at frame @ place, and its palm at frame @ place @ (inverse of frame @ palm): that is to be 1.
         place, quat = np.linalg.inv(frame) @ np.linalg.inv(palm) @ frame, np.empty(4)
@@ -46,15 +48,9 @@ def _write_down_masses(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             body.fullinertia[0], body.ialt.type = np.nan, mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def _poses(model: mujoco.MjModel, *names: str) -> list[np.ndarray]:
-    """Where bodies [4, 4] are in the world, with all joints at their references."""
-    data, poses = mujoco.MjData(model), []
-    mujoco.mj_kinematics(model, data)
-    for body in (model.body(name).id for name in names):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
-        poses.append(pose)
-    return poses
+def _pose(body: Any) -> np.ndarray:
+    """Where a body is in the world [4, 4]."""
+    return np.block([[body.xmat.reshape(3, 3), body.xpos[:, None]], [0, 0, 0, 1]])
 
 
 class Pose(NamedTuple):

@@ -19,7 +19,17 @@ Record = dict[str, Any]
 
 def record_of(hand: Hand | None) -> Record | None:
     """What tells this hand from others; None for the default one."""
-    return None if hand is None or hand.source in ("", DEFAULT) else record_as_of(hand)
+    return None if hand is None or hand.source == DEFAULT else _record(hand)
+
+
+def _record(hand: Hand) -> Record:
+    return {
+        "file": hand.source,
+        "digest": hand.digest,
+        "joints": list(hand.joint_names),
+        "fingers": list(hand.finger_names),
+        "taxels": hand.num_taxels,
+    }
 
 
 def check_same(record: Record | None, hand: Hand, what: str) -> None:
@@ -28,10 +38,10 @@ def check_same(record: Record | None, hand: Hand, what: str) -> None:
     Raises:
       ConfigError: it is of another one; `what` names it.
     """
-    now = record_of(hand)
-    if (record and record["digest"]) != (now and now["digest"]):
-        changed = ": its files have changed since" if record and now and record["file"] == now["file"] else ""
-        raise ConfigError(f"{what}: expected the hand {_name(record)}, got {_name(now)}{changed}")
+    before = record or _record(load_hand())
+    if before["digest"] != hand.digest:
+        changed = ": its files have changed since" if before["file"] == hand.source else ""
+        raise ConfigError(f"{what}: expected the hand {before['file']!r:.200}, got {hand.source!r}{changed}")
 
 
 def recorded_hand(record: Record | None, given: str | Path | None, what: str) -> Hand | None:
@@ -44,54 +54,33 @@ def recorded_hand(record: Record | None, given: str | Path | None, what: str) ->
       ConfigError: the hand is another one, or its record is invalid.
       AssetError: its files are missing or broken.
     """
-    if record is not None:
-        check_record(record)
-    if not given:
-        if record is None:
+    kinds = {"file": str, "digest": str, "joints": list, "fingers": list, "taxels": int}
+    if record is None:
+        if not given:
             return None
+        record = _record(load_hand())
+    elif not isinstance(record, dict) or any(type(record.get(name)) is not kind for name, kind in kinds.items()):
+        raise ConfigError(f"invalid record of the hand: {str(record):.80}")
+    if not given:
         path = find_hand(record["file"])
         if path.suffix != ".toml" or not path.is_file():  # Nothing else is opened, whatever a policy's file names.
-            raise ConfigError(f"{what}: the TOML of its hand {_name(record)} is missing: give --hand FILE")
+            raise ConfigError(f"{what}: the TOML of its hand {record['file']!r:.200} is missing: give --hand FILE")
         hand = load_hand(record["file"])
         check_same(record, hand, what)
         return hand
     hand = load_hand(given)
-    now = record_of(hand)
-    if (record and record["digest"]) != (now and now["digest"]) and not _is_mirrored(record, hand):
-        before: Any = record or record_as_of(load_hand())
-        if before | {"file": "", "digest": ""} != record_as_of(hand) | {"file": "", "digest": ""}:
-            check_same(record, hand, what)
-        warnings.warn(
-            f"{what} is of the hand {_name(record)}, and is used on {_name(now)}", OtherEnvWarning, stacklevel=3
-        )
+    if record["digest"] == hand.digest or _is_mirrored(record, hand):
+        return hand
+    if record | {"file": "", "digest": ""} != _record(hand) | {"file": "", "digest": ""}:
+        check_same(record, hand, what)
+    says = f"{what} is of the hand {record['file']!r:.200}, and is used on {hand.source!r}"
+    warnings.warn(says, OtherEnvWarning, stacklevel=3)
     return hand
 
 
-def _is_mirrored(record: Record | None, hand: Hand) -> bool:
+def _is_mirrored(record: Record, hand: Hand) -> bool:
     """Whether a hand is the mirror image of the recorded one; not known where that one's files are missing."""
     with contextlib.suppress(AssetError):
-        path = find_hand(record["file"] if record else None)
+        path = find_hand(record["file"])
         return path.suffix == ".toml" and is_mirror_image(hand, load_hand(path))
     return False
-
-
-def check_record(record: Any) -> None:
-    """Raises ConfigError: a record of a hand is invalid."""
-    kinds = {"file": str, "digest": str, "joints": list, "fingers": list, "taxels": int}
-    if not isinstance(record, dict) or any(type(record.get(name)) is not kind for name, kind in kinds.items()):
-        raise ConfigError(f"invalid record of the hand: {str(record):.80}")
-
-
-def record_as_of(hand: Hand) -> Record:
-    """What a record counts, of any hand."""
-    return {
-        "file": hand.source,
-        "digest": hand.digest,
-        "joints": list(hand.joint_names),
-        "fingers": list(hand.finger_names),
-        "taxels": hand.num_taxels,
-    }
-
-
-def _name(record: Record | None) -> str:
-    return f"{str(record['file'])[:200]!r}" if record else f"{DEFAULT!r}"

@@ -5,8 +5,9 @@ an axis and a point on it. Units: m, rad, kg, Nm.
 """
 
 import dataclasses
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,11 @@ from dexsim.hand.description import SHAPES, primitive_mesh
 from dexsim.hand.fit import Capsule, PalmBox
 from dexsim.hand.load import is_below, read_coupling
 
-_LEAST_MASS = 1e-3  # kg, of a link that the file gives none
+LEAST_MASS = 1e-3
+"""kg, of a link that the file gives none."""
 _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
-
-Followers = dict[int, tuple[int, float, float]]
-"""Joints that follow another one: which, by what ratio, from what offset [rad]."""
 
 
 @dataclasses.dataclass(eq=False, kw_only=True)
@@ -34,7 +33,7 @@ class Link:
 
     name: str
     parent: int  # -1 for the palm
-    mass: float = _LEAST_MASS
+    mass: float = LEAST_MASS
     centre: np.ndarray  # [3] m, of mass
     inertia: np.ndarray  # [3, 3] kg m^2 about the centre
     surface: Any = None  # trimesh.Trimesh; None where the file has no shape that can be read
@@ -67,7 +66,7 @@ class Draft:
     # From `anatomy.orient`.
     fingers: dict[str, list[int]] = dataclasses.field(default_factory=dict)  # links up to the tip's; thumb first
     side: str = "right"  # or left
-    palm: PalmBox | None = None  # from `import_hand.fit_links`
+    palm: PalmBox = PalmBox(np.zeros(3), np.zeros(3), 0.0)  # from `import_hand.fit_links`
 
     @property
     def motors(self) -> list[Link]:
@@ -90,37 +89,19 @@ def read_hand(
     Raises:
       AssetError: not readable, not a hand, or something that a hand's folder cannot hold.
     """
+    notes: list[str] = []
     try:
-        return _read(path, palm, freeze, couple, drop_tendons)
-    except ElementTree.ParseError as error:
-        raise AssetError(f"{path}: invalid XML: {error}") from None
+        root = ElementTree.fromstring(path.read_bytes())
+        if root.tag not in ("robot", "mujoco"):
+            raise ConfigError(f"expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
+        spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
+        if spec.tendons:
+            _drop_tendons(spec, drop_tendons)
+        links = _read_links(spec.compile(), palm, freeze, couple, _urdf_speeds(root), notes)
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (ValueError, ConfigError) as error:
+    except (ElementTree.ParseError, ValueError, ConfigError) as error:
         raise AssetError(f"{path}: {' '.join(str(error).split())}") from None
-
-
-def _read(path: Path, palm: str, freeze: Sequence[str], couple: Sequence[str], drop_tendons: bool) -> Draft:
-    root, notes = ElementTree.fromstring(path.read_bytes()), list[str]()
-    if root.tag not in ("robot", "mujoco"):
-        raise ConfigError(f"expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
-    spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
-    if spec.tendons:
-        _drop_tendons(spec, drop_tendons)
-    model = spec.compile()
-    names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
-    if unknown := set(freeze) - set(names):
-        raise ConfigError(f"--freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
-    at = _find_palm(model, palm, {j for j, joint in enumerate(names) if joint in freeze})
-    below = [b for b in range(model.nbody) if b != at and is_below(model.body_parentid, b, at)]
-    joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
-    for j in joints:
-        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ConfigError(f"joint {names[j]!r} is not a hinge: --freeze {names[j]} fixes it at 0")
-    followers = _read_followers(model, names, joints, couple, notes)
-    links = _read_links(model, at, below, joints, names, followers, _urdf_speeds(root))
-    if frozen := [name for j, name in enumerate(names) if j not in joints]:
-        notes.append(f"frozen at 0  {', '.join(frozen)}: above the palm, or by --freeze")
     return Draft(name=root.get("name") or root.get("model") or path.stem, links=links, findings=notes)
 
 
@@ -135,8 +116,7 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoc
                 if drawn or not _embed_mesh(path, element, assets, notes):
                     link.remove(element)
         inertial = link.find("inertial")
-        inertia = None if inertial is None else inertial.find("inertia")
-        if inertial is not None and (inertia is None or np.any(np.linalg.eigvalsh(_tensor(inertia)) < _NO_INERTIA)):
+        if inertial is not None and np.any(np.linalg.eigvalsh(_tensor(inertial.find("inertia"))) < _NO_INERTIA):
             notes.append(f"note         link {link.get('name')}: its inertia is no inertia, left out")
             link.remove(inertial)
     for extra in root.findall("mujoco"):
@@ -165,18 +145,15 @@ def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, byte
     shape = element.find("geometry/mesh")
     if shape is None:
         return element.find("geometry/*") is not None
-    name = shape.get("filename", "")
+    name, file = shape.get("filename", ""), f"{len(assets)}.obj"
     try:
         mesh = trimesh.load(_find_file(path, name), force="mesh", process=False)
     except Exception as error:  # each of trimesh's readers raises its own
         notes.append(f"note         mesh {name}: {' '.join(str(error).split())[:80]}")
         return False
-    if not len(mesh.faces):
-        return False
-    file = f"{len(assets)}.obj"
-    assets[file] = mesh.export(file_type="obj", include_normals=False, include_texture=False).encode()
     shape.set("filename", file)
-    return True
+    assets[file] = mesh.export(file_type="obj", include_normals=False, include_texture=False).encode()
+    return len(mesh.faces) > 0
 
 
 def _find_file(path: Path, name: str) -> Path:
@@ -193,10 +170,10 @@ def _urdf_speeds(root: ElementTree.Element) -> dict[str, float]:
     return {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
 
 
-def _tensor(inertia: ElementTree.Element) -> np.ndarray:
-    """The tensor [3, 3] of a URDF's <inertia>."""
+def _tensor(inertia: ElementTree.Element | None) -> np.ndarray:
+    """The tensor [3, 3] of a URDF's <inertia>; zeros for none."""
     names = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-    return np.array([[float(inertia.get(name, 0)) for name in row] for row in names])
+    return np.array([[0.0 if inertia is None else float(inertia.get(name, 0)) for name in row] for row in names])
 
 
 def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
@@ -216,11 +193,9 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
 
 def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
     if not allowed:
-        raise ConfigError(
-            f"tendons {', '.join(tendon.name for tendon in spec.tendons)[:60]}: not supported; --drop-tendons "
-            "gives each of their joints a motor, and --couple FOLLOWER=LEADER:RATIO makes a joint follow another "
-            "(ratio of their angles)"
-        )
+        names = ", ".join(tendon.name for tendon in spec.tendons)[:60]
+        remedy = "--drop-tendons gives each of their joints a motor, --couple FOLLOWER=LEADER:RATIO couples two"
+        raise ConfigError(f"tendons {names}: not supported; {remedy}")
     pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
     for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
         spec.delete(element)
@@ -234,13 +209,12 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
             bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
             raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
         return at
-    chains: dict[int, list[int]] = {}
-    for body in {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}:
-        chains[body] = [body]
-        while chains[body][-1]:
-            chains[body].append(int(model.body_parentid[chains[body][-1]]))
-    inner = {above for chain in chains.values() for above in chain[1:]}
-    fingers = [chain for body, chain in chains.items() if body not in inner]
+    fingers: list[list[int]] = []
+    for body in sorted({int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}):
+        chain = [body]
+        while chain[-1]:
+            chain.append(int(model.body_parentid[chain[-1]]))
+        fingers = [other for other in fingers if other[0] not in chain] + [chain]  # parents come before children
     if len(fingers) < 2:
         raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
     return next(body for body in fingers[0] if all(body in chain for chain in fingers))
@@ -248,21 +222,18 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
 
 def _read_followers(
     model: mujoco.MjModel, names: list[str], joints: list[int], couple: Sequence[str], notes: list[str]
-) -> Followers:
-    direct: Followers = {}
+) -> dict[int, tuple[int, float, float]]:
+    """Joints that follow another one: which, by what ratio, from what offset [rad]."""
+    direct: dict[int, tuple[int, float, float]] = {}
     for e in range(model.neq):
-        coupling = read_coupling(model, e)
-        if coupling is None:
-            notes.append(
-                f"note         equality {model.equality(e).name or f'#{e}'}: left out, it couples no two joints"
-            )
-        else:
+        if coupling := read_coupling(model, e):
             direct[coupling[0]] = coupling[1:]
+        else:
+            notes.append(f"note         equality {model.equality(e).name or e}: left out, it couples no two joints")
     for text in couple:
-        follower, _, rest = text.partition("=")
-        leader, _, number = rest.partition(":")
         try:
-            direct[names.index(follower)] = names.index(leader), float(number or 1), 0.0
+            follower, leader, ratio = re.split("[=:]", text)
+            direct[names.index(follower)] = names.index(leader), float(ratio), 0.0
         except ValueError:
             which = f"joints of {', '.join(names)}"
             raise ConfigError(f"--couple {text}: expected FOLLOWER=LEADER:RATIO, {which}") from None
@@ -293,93 +264,107 @@ def _stall_torques(model: mujoco.MjModel) -> dict[int, float]:
 
 def _read_links(
     model: mujoco.MjModel,
-    palm: int,
-    below: list[int],
-    joints: list[int],
-    names: list[str],
-    followers: Followers,
+    palm_name: str,
+    freeze: Sequence[str],
+    couple: Sequence[str],
     speeds: dict[str, float],
+    notes: list[str],
 ) -> list[Link]:
-    """The palm and a link for each of `joints`; of two hinges on one body the first moves a link without a shape."""
-    data, torques = mujoco.MjData(model), _stall_torques(model)
-    data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
-    mujoco.mj_kinematics(model, data)
-    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
-    moving = {int(model.jnt_bodyid[j]) for j in joints}
-    links = [Link(parent=-1, **_read_body(model, data, palm, palm, moving))]
-    row = {palm: 0}
-    for body in (b for b in below if b in moving):
-        above = int(model.body_parentid[body])
-        while above not in row:
+    """The palm and a link for each hinge below it that is not frozen; of two hinges on one body the first moves a link
+    without a shape."""
+    names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
+    if unknown := set(freeze) - set(names):
+        raise ConfigError(f"--freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
+    palm = _find_palm(model, palm_name, {j for j, joint in enumerate(names) if joint in freeze})
+    below = [b for b in range(model.nbody) if b != palm and is_below(model.body_parentid, b, palm)]
+    joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
+    if frozen := [name for j, name in enumerate(names) if j not in joints]:
+        notes.append(f"frozen at 0  {', '.join(frozen)}: above the palm, or by --freeze")
+    if other := [names[j] for j in joints if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]:
+        raise ConfigError(f"joint {other[0]!r} is not a hinge: --freeze {other[0]} fixes it at 0")
+    followers, torques = _read_followers(model, names, joints, couple, notes), _stall_torques(model)
+    data = _pose_in_palm_frame(model, palm)
+    last = {int(model.jnt_bodyid[j]): j for j in joints}  # of each body that moves
+    links, row = [Link(parent=-1, **_read_body(model, data, palm, last))], {palm: 0}
+    for j in joints:
+        body, above = int(model.jnt_bodyid[j]), int(model.jnt_bodyid[j])
+        while above not in row:  # the body itself where another hinge moves it already
             above = int(model.body_parentid[above])
-        own = [j for j in joints if model.jnt_bodyid[j] == body]
-        for j in own:
-            anchor = turn.T @ (data.xanchor[j] - origin)
-            content = {"name": f"{names[j]}_link", "centre": anchor, "inertia": _LEAST_INERTIA * np.eye(3)}
-            if j == own[-1]:
-                content = _read_body(model, data, palm, body, moving)
-            low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
-            leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
-            link = Link(
-                parent=row[above] if j == own[0] else len(links) - 1,
-                joint=names[j],
-                axis=turn.T @ data.xaxis[j],
-                anchor=anchor,
-                low=float(low),
-                high=float(high),
-                torque=torques.get(j, 0.0),
-                speed=speeds.get(names[j], 0.0),
-                leader=names[leader] if leader >= 0 else "",
-                ratio=ratio,
-                offset=offset,
-                **content,
-            )
-            links.append(link)
-        row[body] = len(links) - 1
+        content = {"name": f"{names[j]}_link", "centre": data.xanchor[j], "inertia": _LEAST_INERTIA * np.eye(3)}
+        if j == last[body]:
+            content = _read_body(model, data, body, last)
+        low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
+        leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
+        link = Link(
+            parent=row[above],
+            joint=names[j],
+            axis=data.xaxis[j],
+            anchor=data.xanchor[j],
+            low=float(low),
+            high=float(high),
+            torque=torques.get(j, 0.0),
+            speed=speeds.get(names[j], 0.0),
+            leader=names[leader] if leader >= 0 else "",
+            ratio=ratio,
+            offset=offset,
+            **content,
+        )
+        row[body] = len(links)
+        links.append(link)
     return links
 
 
-def _read_body(model: mujoco.MjModel, data: mujoco.MjData, palm: int, body: int, moving: set[int]) -> dict[str, Any]:
-    """Name, mass and surface of a body with all that is fixed to it, in the palm's frame: fields of `Link`."""
+def _pose_in_palm_frame(model: mujoco.MjModel, palm: int) -> mujoco.MjData:
+    """Poses of all bodies, joints and geoms with every hinge at 0, in the palm's frame in place of the world's."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    turn, origin = data.xmat[palm].reshape(3, 3).copy(), data.xpos[palm].copy()
+    for points in (data.xpos, data.xipos, data.xanchor, data.geom_xpos):
+        points[:] = (points - origin) @ turn
+    for axes in (data.xmat, data.ximat, data.geom_xmat):
+        axes[:] = (turn.T @ axes.reshape(-1, 3, 3)).reshape(-1, 9)
+    data.xaxis[:] = data.xaxis @ turn
+    return data
+
+
+def _read_body(model: mujoco.MjModel, data: mujoco.MjData, body: int, moving: Collection[int]) -> dict[str, Any]:
+    """Name, mass and surface of a body with all that is fixed to it: fields of `Link`."""
     import trimesh
 
     members = [body]
     for other in range(body + 1, model.nbody):
         if int(model.body_parentid[other]) in members and other not in moving:
             members.append(other)
-    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
     masses = model.body_mass[members]
     # MuJoCo puts the centre of a body without mass and shape anywhere.
     places = np.where((masses > _NO_MASS)[:, None], data.xipos[members], data.xpos[members])
-    places = (places - origin) @ turn
     mass = float(masses.sum())
     centre = masses @ places / mass if mass > 0 else places[0]
-    axes, arms = turn.T @ data.ximat[members].reshape(-1, 3, 3), places - centre
+    axes, arms = data.ximat[members].reshape(-1, 3, 3), places - centre
     inertia = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia[members], axes)
     inertia += np.sum(masses * np.sum(arms**2, 1)) * np.eye(3) - (masses * arms.T) @ arms  # parallel axes
     parts = [shape for b in members for shape in _read_shapes(model, data, b)]
     surface = trimesh.util.concatenate(parts) if parts else None
-    if surface is not None:
-        surface.vertices = (surface.vertices - origin) @ turn
     name = (model.body(body).name if body else "palm") or f"link_{body}"
     return {"name": name, "mass": mass, "centre": centre, "inertia": inertia, "surface": surface}
 
 
 def _read_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[Any]:
-    """The shapes of a body in the world: its meshes, or else its primitives."""
+    """The shapes of a body: its meshes, or else its primitives."""
     import trimesh
 
     geoms = np.flatnonzero(model.geom_bodyid == body)
     meshes = geoms[model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH]
     shapes = []
     for g in meshes if len(meshes) else geoms:
-        if kind := SHAPES.get(int(model.geom_type[g])):
-            shape = primitive_mesh(kind, model.geom_size[g])
-        elif len(meshes):
-            mesh = model.geom_dataid[g]
-            vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-            faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
+        if len(meshes):
+            mesh = model.mesh(model.geom_dataid[g])
+            vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+            faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
             shape = trimesh.Trimesh(vertices, faces, process=False)
+        elif kind := SHAPES.get(int(model.geom_type[g])):
+            shape = primitive_mesh(kind, model.geom_size[g])
         else:
             continue
         shape.vertices = shape.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]

@@ -1,6 +1,7 @@
 """Which objects are drawn, and from which ranges."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
@@ -85,11 +86,6 @@ class ObjectConfig(Config):
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """Names in KINDS of what is drawn."""
-        return ("mesh",) if self.mesh else self.shapes
-
-    @property
     def slots(self) -> tuple[str, ...]:
         """Primitives of the compiled template: those that its shapes need."""
         if self.mesh:
@@ -119,9 +115,7 @@ def load_mesh_object(config: ObjectConfig) -> MeshObject:
     Raises:
       AssetError: see `dexsim.objects.mesh.load`.
     """
-    return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts, repair=config.mesh_repair)
-
-
-def nominal(config: ObjectConfig, name: str) -> float:
-    """The nominal value of a range of `ObjectConfig`."""
-    return 1.0 if name == "inertia_scale" else sum(getattr(config, name)) / 2
+    file = Path(config.mesh).expanduser()
+    changed = file.stat().st_mtime_ns if file.is_file() else 0
+    unit, parts, repair = config.mesh_unit, config.mesh_parts, config.mesh_repair
+    return load(str(file), unit=unit, parts=parts, repair=repair, changed=changed)

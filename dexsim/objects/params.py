@@ -18,47 +18,13 @@ from dexsim.geometry import rotations, sdf
 from dexsim.objects.config import (
     INACTIVE_SIZE,
     KINDS,
+    PROPERTY_RANGES,
     SHAPES,
     SLOTS,
     SPHERE_HALF_LENGTH,
     ObjectConfig,
     load_mesh_object,
-    nominal,
 )
-
-
-def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
-    """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
-    radius = {
-        "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
-        "capsule": lambda s: s[0] + s[1],
-        "cylinder": lambda s: jnp.hypot(s[0], s[1]),
-    }
-    return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
-
-
-def extent(
-    size: jax.Array,
-    position: jax.Array,
-    active: jax.Array,
-    direction: jax.Array,
-    kinds: tuple[str, ...] = SLOTS,
-    quat: jax.Array | None = None,
-) -> jax.Array:
-    """How far [] m the object of these `ObjectParams` reaches along a unit `direction` [3] of its own frame."""
-    reaches = []
-    for k, kind in enumerate(kinds):
-        local = direction if quat is None else rotations.rotate_inverse(rotations.quat_to_matrix(quat[k]), direction)
-        along, (a, b, c) = jnp.abs(local), size[k]
-        reaches.append(
-            {
-                "box": along[0] * a + along[1] * b + along[2] * c,
-                "capsule": a + b * along[2],
-                "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
-            }[kind]
-        )
-    reach = jnp.stack(reaches) + jnp.sum(position * direction[None], -1)
-    return jnp.max(jnp.where(active, reach, -jnp.inf))
 
 
 @pytree_dataclass
@@ -88,14 +54,41 @@ class ObjectParams:
         return sdf.Shape(self.kinds, self.size, self.position, rotation, self.active)
 
 
+def bounding_radius(size: jax.Array, kinds: tuple[str, ...]) -> jax.Array:
+    """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
+    radius = {
+        "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
+        "capsule": lambda s: s[0] + s[1],
+        "cylinder": lambda s: jnp.hypot(s[0], s[1]),
+    }
+    return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
+
+
+def extent(object: ObjectParams, direction: jax.Array) -> jax.Array:
+    """How far [] m the object reaches along a unit `direction` [3] of its own frame."""
+    reaches = []
+    for k, kind in enumerate(object.kinds):
+        local = direction
+        if object.quat is not None:
+            local = rotations.rotate_inverse(rotations.quat_to_matrix(object.quat[k]), direction)
+        along, (a, b, c) = jnp.abs(local), object.size[k]
+        reach = {
+            "box": along[0] * a + along[1] * b + along[2] * c,
+            "capsule": a + b * along[2],
+            "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
+        }
+        reaches.append(reach[kind])
+    reach = jnp.stack(reaches) + jnp.sum(object.position * direction[None], -1)
+    return jnp.max(jnp.where(object.active, reach, -jnp.inf))
+
+
 def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array | None = None) -> ObjectParams:
     """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
 
     Raises:
       AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
-    keys, extreme = jax.random.split(key, 8), sample_extreme(key, config.extremes)
-    zero, three, quat = jnp.zeros(()), jnp.zeros(3), None  # what stands in for properties
+    keys, extreme, quat = jax.random.split(key, 8), sample_extreme(key, config.extremes), None
     if config.mesh:
         mesh_object = load_mesh_object(config)
         boxes, factor = mesh_object.boxes, uniform(keys[1], config.mesh_size, extreme)
@@ -113,10 +106,8 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
         mass, com, inertia = _mass_properties(kinds, size, position, active)
         position = position - com[None]  # the origin is the centre of a uniform solid
         plain = inertia / mass
-    object = ObjectParams(
-        shape_index, size, position, active, zero, three, three, zero, zero, jnp.zeros(2), quat, kinds, extreme
-    )
-    return _with_properties(object, plain, _sample_properties(keys, config, extreme))
+    properties = _fields(_sample_properties(keys, config, extreme), plain)
+    return ObjectParams(shape_index, size, position, active, quat=quat, kinds=kinds, extreme=extreme, **properties)
 
 
 # --- properties: what an object is beside its shape, by the names of `PROPERTY_RANGES` -----------
@@ -132,20 +123,33 @@ def resample_properties(
       names: the ranges, of `PROPERTY_RANGES`, that are drawn.
     """
     drawn = _sample_properties(jax.random.split(key, 8), config, object.extreme)
-    properties = _properties_of(object, plain)
-    return _with_properties(object, plain, properties | {name: drawn[name] for name in names})
+    properties = _properties_of(object, plain) | {name: drawn[name] for name in names}
+    return dataclasses.replace(object, **_fields(properties, plain))
+
+
+def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
+    """A drawn object with its properties nearer to nominal: mass, inertia, centre of mass, friction, contact.
+
+    Args:
+      plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
+      scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
+    """
+    fixed = {"com_offset": 0.0, "inertia_scale": 1.0, "restitution": damping_ratio(sum(config.restitution) / 2)}
+    near = {}
+    for name, value in _properties_of(object, plain).items():
+        middle = fixed[name] if name in fixed else sum(getattr(config, name)) / 2
+        near[name] = middle + scale * (value - middle)
+    return dataclasses.replace(object, **_fields(near, plain))
 
 
 def _sample_properties(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:
     """One value of each of `PROPERTY_RANGES`; "com_offset" is the centre of mass [3], "restitution" a damping ratio."""
-    names = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
-    spans = [(-1.0, 1.0) if name == "com_offset" else getattr(config, name) for name in names]
+    spans = [(-1.0, 1.0) if name == "com_offset" else getattr(config, name) for name in PROPERTY_RANGES]
     keys = jnp.concatenate([keys[2:], jax.random.fold_in(keys[5], 1)[None]])
-    rows = dict(zip(names, uniforms(keys, spans, extreme, (3,)), strict=True))
-    properties = {name: row if name == "com_offset" else row[0] for name, row in rows.items()}
-    return properties | {
-        "com_offset": config.com_offset * properties["com_offset"],
-        "restitution": damping_ratio(properties["restitution"]),
+    rows = dict(zip(PROPERTY_RANGES, uniforms(keys, spans, extreme, (3,)), strict=True))
+    return {name: row[0] for name, row in rows.items()} | {
+        "com_offset": config.com_offset * rows["com_offset"],
+        "restitution": damping_ratio(rows["restitution"][0]),
     }
 
 
@@ -162,17 +166,16 @@ def _properties_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Arra
     }
 
 
-def _with_properties(object: ObjectParams, plain: jax.Array, properties: dict[str, jax.Array]) -> ObjectParams:
-    """The object with these properties; see `_properties_of`."""
-    return dataclasses.replace(
-        object,
-        mass=properties["mass"],
-        inertia=properties["mass"] * plain * properties["inertia_scale"],
-        com=properties["com_offset"],
-        friction=properties["friction"],
-        contact=jnp.stack([properties["stiffness"], properties["restitution"]]),
-        link_friction=properties["link_friction"],
-    )
+def _fields(properties: dict[str, jax.Array], plain: jax.Array) -> dict[str, Any]:
+    """These properties as fields of `ObjectParams`; see `_properties_of`."""
+    return {
+        "mass": properties["mass"],
+        "inertia": properties["mass"] * plain * properties["inertia_scale"],
+        "com": properties["com_offset"],
+        "friction": properties["friction"],
+        "contact": jnp.stack([properties["stiffness"], properties["restitution"]]),
+        "link_friction": properties["link_friction"],
+    }
 
 
 def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
@@ -182,20 +185,6 @@ def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> ja
         return (object.size[0, 0] / mesh_object.boxes.size[0, 0]) ** 2 * jnp.asarray(mesh_object.inertia)
     mass, _, inertia = _mass_properties(object.kinds, object.size, object.position, object.active)
     return inertia / mass
-
-
-def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
-    """A drawn object with its properties nearer to nominal: mass, inertia, centre of mass, friction, contact.
-
-    Args:
-      plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
-      scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
-    """
-    properties = _properties_of(object, plain)
-    middle: dict[str, Any] = {name: 0.0 if name == "com_offset" else nominal(config, name) for name in properties}
-    middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
-    near = {name: middle[name] + scale * (value - middle[name]) for name, value in properties.items()}
-    return _with_properties(object, plain, near)
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:

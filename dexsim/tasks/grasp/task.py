@@ -172,10 +172,8 @@ class Grasp(Task):
         matrix = rotations.quat_to_matrix(quat)
         # How far the object reaches [6] along the palm's axes, in both directions. Its middle, not its origin, is put
         # where the fingers meet: that of a composition is in its body, beside which the neck juts out.
-        parts = object.size, object.position, object.active
-        reach = jax.vmap(lambda way: extent(*parts, rotations.rotate_inverse(matrix, way), object.kinds, object.quat))(
-            jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
-        )
+        ways = jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
+        reach = jax.vmap(lambda way: extent(object, rotations.rotate_inverse(matrix, way)))(ways)
         middle = (reach[1:3] - reach[4:]) / 2
         position = jnp.stack([palm_height(hand) + gap + reach[3], *(jnp.asarray(reference[1:]) + shift - middle)])
         qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
@@ -185,7 +183,7 @@ class Grasp(Task):
     @property
     def drawn_shapes(self) -> tuple[str, ...]:
         """Names, of `shape_names`, of what the pool has."""
-        return self.config.objects.kinds
+        return ("mesh",) if self.config.objects.mesh else self.config.objects.shapes
 
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         low, high = self.config.release_delay

@@ -107,8 +107,7 @@ def solid_inertia(object: ObjectParams) -> jax.Array:
 def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Array:
     """Smallest coordinate [] m of the object along the palm's normal (x)."""
     down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
-    reach = extent(object.size, object.position, object.active, down, object.kinds, object.quat)
-    return position[0] - reach
+    return position[0] - extent(object, down)
 
 
 def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:

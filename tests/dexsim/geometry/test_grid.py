@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.interpolate import RegularGridInterpolator
 from shapes import bake, bounds, solid
 
 from dexsim.core.errors import AssetError
 from dexsim.geometry import grid, mesh, sdf
 
-trimesh = pytest.importorskip("trimesh")
 BOX = np.array([0.025, 0.02, 0.03])
 COARSE = 24  # nodes
 signed_distance = jax.jit(grid.signed_distance)
@@ -43,14 +43,7 @@ def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
 def test_distance_to_a_box_mesh_is_the_closed_form():
     box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
-    value, gradient = mesh.signed_distance(box, points)
-    np.testing.assert_allclose(value, box_distance(points), atol=1e-12)
-    step = 1e-7
-    numeric = np.stack(
-        [(box_distance(points + step * e) - box_distance(points - step * e)) / (2 * step) for e in np.eye(3)], -1
-    )
-    smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-4
-    np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
+    np.testing.assert_allclose(mesh.signed_distance(box, points), box_distance(points), atol=1e-12)
 
 
 def turned(part):
@@ -69,8 +62,10 @@ def bad_meshes():
     nan, mixed = vertices.copy(), faces.copy()
     nan[3, 1] = np.nan
     mixed[4] = mixed[4][::-1]
+    touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
     return {
         "open": (vertices, faces[:-1]),
+        "non-manifold: 1 edges have more than two": touching,
         "inward": turned(box.copy()),
         "both ways": (vertices, mixed),
         "no volume": flat(box.copy()),
@@ -86,13 +81,6 @@ def bad_meshes():
 def test_a_bad_mesh_is_an_error(word):
     with pytest.raises(AssetError, match=word):
         mesh.load_mesh(bad_meshes()[word])
-
-
-def test_an_edge_of_four_triangles_is_named():
-    box = trimesh.creation.box(2 * BOX)
-    touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
-    with pytest.raises(AssetError, match="non-manifold: 1 edges have more than two"):
-        mesh.load_mesh(touching)
 
 
 @pytest.mark.parametrize("repair", ["shell", "hull"])
@@ -119,7 +107,7 @@ def test_a_hollow_ball_is_signed_right():
     outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.03, 0.02))
     hollow = mesh.load_mesh(trimesh.util.concatenate([outer, turned(inner)]))
     mesh.check_sign(hollow)
-    value, _ = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
+    value = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
     np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 from shapes import bounds, solid
 
@@ -61,7 +62,6 @@ def test_sizes_may_be_traced_and_differ_between_environments():
 
 
 def test_points_of_a_mesh():
-    trimesh = pytest.importorskip("trimesh")
     ball = mesh.load_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
     surface = surface_points.from_mesh(ball, FEW)
     gap = cKDTree(np.asarray(surface.position)).query(np.asarray(surface.position), k=2)[0][:, 1]

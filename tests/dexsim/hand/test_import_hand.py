@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from dexsim import check_hand, import_hand
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
-from dexsim.hand.fit import fit_capsule, segment_distance
+from dexsim.hand.fit import fit_capsule
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
-from dexsim.hand.posture import find_grasp, is_near
+from dexsim.hand.posture import find_grasp
 from dexsim.hand.vendor import read_hand
 from dexsim.randomization import Randomization, sample_hand
 from dexsim.tasks.grasp.config import GraspConfig
@@ -130,7 +130,7 @@ class TestUrdf:
     @pytest.mark.parametrize("name", ["plain", "left"])
     def test_a_written_hand_keeps_the_conventions(self, hands, name, tmp_path):
         posture, centre, gaps = find_grasp(load_hand(write_hand(hands[name], "hand", ["--"], tmp_path)), 0.006)
-        assert is_near(gaps, 0.006).all() and gaps.min() >= 0.006
+        assert gaps.min() >= 0.006 and gaps.max() < 0.026
         grasp = {"posture": posture, "centre": centre}
         hand = load_hand(write_hand(hands[name], "hand", ["--"], tmp_path, grasp))
         assert not [check(hand) for what, check in check_hand.CHECKS.items() if "random" not in what and check(hand)]
@@ -212,10 +212,10 @@ def test_what_cannot_be_imported_is_one_line(tmp_path, what):
 def test_the_frame_is_confirmed(tmp_path):
     with pytest.raises(ConfigError, match="not a terminal: --yes accepts"):
         import_hand.main([str(mjcf(tmp_path)), "--out", str(tmp_path)])
-    np.testing.assert_allclose(import_hand.parse_axis("-y"), [0, -1, 0])
-    np.testing.assert_allclose(import_hand.parse_axis("0,3,4"), [0, 0.6, 0.8])
-    with pytest.raises(ConfigError, match="axis 'up'"):
-        import_hand.parse_axis("up")
+    draft = read_hand(mjcf(tmp_path))
+    orient(draft, along=(0, 0, 2), normal=(-1, 0, 0.1))
+    (link,) = (link for link in draft.links if link.joint == "f_a")
+    assert draft.side == "left" and abs(link.axis[1]) == 1 and link.anchor[2] == 0.05
 
 
 def test_a_capsule_is_fitted_to_itself():
@@ -227,7 +227,3 @@ def test_a_capsule_is_fitted_to_itself():
     fit = fit_capsule(bar, turn @ [0.1, 0, 0.995])
     np.testing.assert_allclose(fit.ends, [-length / 2 * turn[:, 2], length / 2 * turn[:, 2]], atol=3e-4)
     assert abs(fit.radius - radius) < 1e-4 and fit.error[1] < 3e-4
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
-    steps = fit.ends[0] + np.linspace(0, 1, 2001)[:, None] * (fit.ends[1] - fit.ends[0])
-    brute = np.linalg.norm(points[:, None] - steps, axis=-1).min(1)
-    np.testing.assert_allclose(segment_distance(points, *fit.ends), brute, atol=1e-5)

@@ -1,8 +1,5 @@
 """Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
 
-import dataclasses
-import re
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +7,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shapes import solid
 
-from dexsim.check_hand import check_taxels
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
 from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
@@ -60,14 +56,6 @@ def test_a_written_layout_is_read_back(tmp_path):
     taxels = lay_taxels((4, 3), pitch=0.002, radius=0.01)
     path = write_layout(tmp_path / "taxels.csv", {"a": taxels, "b": taxels[::-1]}, (4, 3))
     np.testing.assert_allclose(read_taxels(path, ("b", "a"), (4, 3)), [taxels[::-1], taxels], atol=1e-6)
-
-
-def test_a_sunk_taxel_is_named(hand):
-    sunk = dataclasses.replace(hand, taxel_position=hand.taxel_position.copy())
-    sunk.taxel_position[1, 17] -= 0.004 * sunk.taxel_normal[1, 17]
-    assert not check_taxels(hand)
-    where = r"^finger 'index': taxel column 1, row 5 lies [34](\.\d)? mm inside its link \(1 of 120\)$"
-    assert re.search(where, check_taxels(sunk))
 
 
 def test_taxels_of_a_pad_are_on_it_and_face_as_told():

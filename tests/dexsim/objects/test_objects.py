@@ -11,11 +11,7 @@ import pytest
 from shapes import bounds
 
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
-from dexsim.objects.params import (
-    extent,
-    sample_object,
-    unit_inertia,
-)
+from dexsim.objects.params import extent, sample_object, unit_inertia
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {
@@ -144,5 +140,5 @@ def test_extent_is_the_bound_of_the_turned_shape():
         one = row(default(), at)
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32)
         shape = dataclasses.replace(one.shape(), position=one.position @ turn.T, rotation=np.stack([turn] * 3))
-        reach = [extent(one.size, one.position, one.active, sign * turn[2]) for sign in (-1, 1)]
+        reach = [extent(one, sign * turn[2]) for sign in (-1, 1)]
         np.testing.assert_allclose([-reach[0], reach[1]], bounds(shape)[:, 2], atol=1e-6)
