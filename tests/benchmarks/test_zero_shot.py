@@ -8,6 +8,7 @@ import pytest
 from paths import ROOT
 
 from dexsim.core.errors import DexsimError
+from dexsim_real.twin.plant.parameters import start_of
 from dexsim_real.twin.plant.referee import Referee
 
 
@@ -99,10 +100,10 @@ def test_measured_torque_is_of_touching_fingers_in_the_window(zero_shot):
     assert zero_shot._measured_torque(trace[:2], [3.0, 8.0]) == 0.0
 
 
-def test_both_worlds_name_forces_alike():
+def test_both_worlds_name_forces_alike(hand):
     """What the referee reports is what the task's report reduces, name by name."""
     from dexsim.tasks.grasp.report import FORCES, window
 
-    judge = Referee("grasp", np.zeros(3), np.eye(3)[0])
+    judge = Referee("grasp", start_of(hand, "grasp"))
     assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
     assert judge.window == window(judge.limit) == (3.0, 8.0)

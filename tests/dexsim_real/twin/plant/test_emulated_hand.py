@@ -12,8 +12,8 @@ from emulated_plant import free, motors, world
 from dexsim.randomization import tilted_down
 from dexsim_real.twin.plant import emulated_hand, scene
 from dexsim_real.twin.plant.drives import PERIOD
-from dexsim_real.twin.plant.emulated_hand import GRAVITY, EmulatedHand, Stage, nominal_gravity, put, tilted_gravity
-from dexsim_real.twin.plant.parameters import TASKS
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put, tilted
+from dexsim_real.twin.plant.parameters import GRAVITY, TASKS, start_of
 from dexsim_real.twin.plant.shapes import matrix
 from dexsim_real.wire.frames import Mode
 
@@ -32,17 +32,17 @@ def test_free_fall(hand):
     held = world(hand, "rotate", imu_noise=0.0)
     held.advance(0.05)
     _, quat, felt = held.measure_object()
-    assert matrix(quat) @ felt == pytest.approx(-nominal_gravity("rotate"), abs=1e-6)
+    assert matrix(quat) @ felt == pytest.approx(-held.start.gravity, abs=1e-6)
 
 
 @pytest.mark.parametrize("task", SKILLS)
-def test_the_ends_of_trainings_tilts_are_those_of_a_mount(task):
+def test_the_ends_of_trainings_tilts_are_those_of_a_mount(hand, task):
     """Pitch and roll on both sides, each in its own way; which sign is which says nothing."""
-    down = nominal_gravity(task) / GRAVITY
+    down = start_of(hand, task).gravity
     for pitch, roll in ((0.1, 0.1), (0.1, 0.0), (0.0, 0.1)):
         angles = np.array([(a * pitch, b * roll) for a in (-1, 1) for b in (-1, 1)])
-        trained = np.stack([tilted_down(down, jnp.asarray(both)) for both in angles])
-        mounted = np.stack([tilted_gravity(task, both) for both in angles]) / GRAVITY
+        trained = np.stack([tilted_down(down / GRAVITY, jnp.asarray(both)) for both in angles])
+        mounted = np.stack([tilted(down, both) for both in angles]) / GRAVITY
         assert np.linalg.norm(mounted, axis=-1) == pytest.approx(1.0)
         apart = np.linalg.norm(trained[:, None] - mounted, axis=-1)
         assert np.all(apart.min(0) < 1e-3) and np.all(apart.min(1) < 1e-3)

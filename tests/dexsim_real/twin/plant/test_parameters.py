@@ -16,8 +16,8 @@ from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.objects import CLEARANCE
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand, referee
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear, nominal_gravity, start_of
-from dexsim_real.twin.plant.parameters import BANDS, FAR, NEAR, PUSHES, TASK_BANDS, sample_trial, skill_of
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear
+from dexsim_real.twin.plant.parameters import BANDS, FAR, NEAR, PUSHES, TASK_BANDS, sample_trial, skill_of, start_of
 
 SKILLS = ("grasp", "rotate", "rotate_clear")  # rotate_any shares all but its objects and its mount with rotate
 
@@ -76,11 +76,11 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     start = start_of(hand, task)
     assert start.reference == pytest.approx(rules.reference)
     assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
-    assert nominal_gravity(task) == pytest.approx(rules.gravity)
+    assert start.gravity == pytest.approx(rules.gravity)
     if skill == "rotate":
         assert start.axis == pytest.approx(rules.turn.unit_axis) and referee.ON_PALM == CLEARANCE
         turn = rules.config.turn
-        ours = (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
+        ours = (start.turn, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
         assert ours == pytest.approx((turn.step, turn.angle, turn.distance, turn.spin, rules.config.drop_tilt))
 
 
@@ -98,7 +98,7 @@ def test_a_cube_between_the_fingertips_is_put_where_they_carry_it(hand):
     for trial in range(3):
         plant = EmulatedHand(hand, "rotate_clear", 7, first=trial)
         place, scene, data = plant._place, plant._scene, mujoco.MjData(plant._scene.model)
-        scene.set_joints(data, plant._start.posture)
+        scene.set_joints(data, plant.start.posture)
         at, lower = place.position, place.position - 0.001 * plant.up
         assert is_clear(scene, data, at, place.quat) and not is_clear(scene, data, lower, place.quat)
 
