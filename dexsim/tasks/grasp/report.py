@@ -47,12 +47,39 @@ def summarize(
       pressed. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
-    held, command, shape = alive[-1], metrics["command"][0], metrics["shape"][0].astype(int)
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
-    target = target_force(command, span)
     # Of each episode [N], the mean over its late ticks.
     late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*_COMMANDED, *_MEANS)}
-    commanded = {part: late_means[f"finger_{part}"] for part in FORCES.values()}
+    report = {
+        "episodes": episodes,
+        "seconds": ticks * control_period,
+        "window_s": list(window(ticks * control_period)),
+        **reduce(metrics["command"][0], alive[-1], metrics["shape"][0].astype(int), late_means, span, shapes),
+        "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
+        "non_finite": int(metrics["non_finite"].sum()),
+    }
+    return report | {"headline": _headline(report)}
+
+
+def reduce(
+    command: np.ndarray,
+    held: np.ndarray,
+    shape: np.ndarray,
+    means: dict[str, np.ndarray],
+    span: tuple[float, float],
+    shapes: tuple[str, ...],
+) -> dict:
+    """What the reports of simulation and of the emulated hand have in common; see `summarize`.
+
+    Args:
+      command: [N] of each episode.
+      held: [N] bool, to the end.
+      shape: [N] index of each episode's shape in `shapes`.
+      means: [N] by metric, over the window; 0 for the time after the object was lost.
+      span: N, a finger's target at command 0 and 1.
+      shapes: names.
+    """
+    target, commanded = target_force(command, span), {part: means[f"finger_{part}"] for part in FORCES.values()}
 
     def command_row(level: float) -> dict:
         mine = command == level
@@ -62,8 +89,8 @@ def summarize(
             "episodes": int(mine.sum()),
             "held": proportion(held[mine]),
             "target_force_n": float(target[mine].mean()),
-            **{_UNITS.get(name, f"{name}_n"): mean(values[good]) for name, values in late_means.items()},
-            "saturates": saturates(late_means["torque_limited"][good]),
+            **{_UNITS.get(name, f"{name}_n"): mean(values[good]) for name, values in means.items()},
+            "saturates": saturates(means["torque_limited"][good]),
         }
 
     def shape_row(index: int) -> dict:
@@ -76,23 +103,17 @@ def summarize(
             "force_error_n": force_error(commanded["force"][mine], target[mine]),
         }
 
-    report = {
-        "episodes": episodes,
-        "seconds": ticks * control_period,
-        "window_s": list(window(ticks * control_period)),
+    return {
         "held": proportion(held),
         **correlations(command, held, commanded),
-        "r_torque": pearson(command[held], late_means["total_torque"][held]),
+        "r_torque": pearson(command[held], means["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
-        "slope_torque": slope(command[held], late_means["total_torque"][held]),
+        "slope_torque": slope(command[held], means["total_torque"][held]),
         "force_error_n": force_error(commanded["force"], target),
-        "torque_limited": mean(late_means["torque_limited"][held]),
-        "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
-        "non_finite": int(metrics["non_finite"].sum()),
+        "torque_limited": mean(means["torque_limited"][held]),
         "by_command": [command_row(level) for level in np.unique(command)],
         "by_shape": [shape_row(index) for index in np.unique(shape)],
     }
-    return report | {"headline": _headline(report)}
 
 
 def _headline(report: dict) -> dict:

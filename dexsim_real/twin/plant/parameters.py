@@ -232,8 +232,8 @@ def start_of(hand: Hand, task: str) -> Start:
     if task == "rotate_clear":
         if hand.num_joints != len(CLEAR_POSTURE):
             raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
-        reference, place, down = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, gravity(-1.1, 0.0, side)
-        return Start(np.array(CLEAR_POSTURE), reference, place, down, quarter, np.array((0.6, 0.0, -0.8)))
+        middle, place, axis = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array((0.6, 0.0, -0.8))
+        return Start(np.array(CLEAR_POSTURE), middle, place, gravity(-1.1, 0.0, side), quarter, axis)
     if skill_of(task) == "grasp":
         posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
         place, down = np.array(reference[1:]), GRAVITY * np.array([1.0, 0.0, 0.0])
