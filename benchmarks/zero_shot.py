@@ -28,6 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from dexsim.core import cli
@@ -35,46 +36,40 @@ from dexsim.core.assets import asset_path
 from dexsim.core.errors import DexsimError
 from dexsim.core.statistics import mean, proportion, ratio
 from dexsim.hand.description import Hand
+from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
 from dexsim.tasks.grasp.report import FORCES, reduce
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import KINDS, TASKS, sample_trial
 from dexsim_real.twin.plant.shapes import SHAPES, matrix
+from dexsim_real.twin.virtual import VirtualRun
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @functools.lru_cache(maxsize=2)
-def load(name: str, idle: bool, hand_name: str = "") -> tuple[Any, Any, Any]:
-    """Hand, controller and calibration; loaded once per process. An idle policy's actions are zero."""
-    from dexsim_real.control.controller import Controller, prepare_jax
-
+def load(name: str, idle: bool, hand: str = "") -> Controller:
+    """The controller of a policy; loaded once per process. An idle policy's actions are zero."""
     prepare_jax()
-    import jax
-
-    from dexsim import load_hand
-    from dexsim_ppo.policy import load_policy
-    from dexsim_real.twin.virtual import ideal_calibration
-
-    hand, policy = load_hand(hand_name), load_policy(name)
+    policy = load_policy(name)
     if idle:
         layers = jax.tree.map(np.zeros_like, policy.params.layers)
         policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=layers))
-    controller = Controller(policy, hand)
+    controller = Controller(policy, load_hand(hand))
     controller.warm()
-    return hand, controller, ideal_calibration(hand)
+    return controller
 
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """One trial: the referee's report, with the bridge's measurements as `bridge`."""
-    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-    from dexsim_real.twin.virtual import VirtualRun
-
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    hand, controller, calibration = load(options["policy"], options.get("idle", False), options.get("hand", ""))
+    controller = load(options["policy"], options.get("idle", False), options.get("hand", ""))
     plant = EmulatedHand(
-        hand,
+        controller.hand,
         options["task"],
         seed,
         kind=options["parameters"],
@@ -86,9 +81,9 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
-    run = VirtualRun(plant, controller, calibration, command, limits)
+    run = VirtualRun(plant, controller, command, limits)
     trace = [
-        (time, tick.readings.joint_torque[hand.root_joint], run.policy.sample.measured.finger_force)
+        (time, tick.readings.joint_torque[plant.hand.root_joint], run.policy.sample.measured.finger_force)
         for time, tick in run.ticking()
     ]
     report = run.report()
@@ -194,8 +189,6 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
     lost = {"lost": dict(causes.most_common())}
     if task != "grasp":
         return rotate_metrics(reports) | lost
-    from dexsim_ppo.policy import load_policy
-
     return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"])) | lost
 
 
@@ -316,10 +309,6 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     SafetyConfig(**given.limit)
     if given.json:
         cli.check_writable(given.json)  # All trials would be lost.
-
-    from dexsim_ppo.policy import load_policy
-    from dexsim_real.control.controller import prepare_jax
-
     prepare_jax()  # As the trials need it, before anything is computed.
     load_policy(given.policy, task=given.task)
     return given
@@ -358,7 +347,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}")
     print(table(here, there, idle))
     if pictures:
-        print(*draw_losses(pictures, load(policy, False, options.get("hand", ""))[0], reports), sep="\n")
+        print(*draw_losses(pictures, load(policy, False, options["hand"]).hand, reports), sep="\n")
     return 0
 
 

@@ -13,7 +13,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
-from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.twin.virtual import VirtualRun
 from dexsim_real.wire.serial_hand import check_wire
 
 
@@ -33,7 +33,6 @@ class Emulation:
         check_wire(self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
-        self._calibration = ideal_calibration(self.hand)
         self.period, self.task, self._seed, self._trial = self._controller.period, policy.task, seed, -1
 
     def add_controls(self, gui: Any) -> None:
@@ -45,7 +44,7 @@ class Emulation:
     def reset(self) -> Frame:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
-        self._run = VirtualRun(plant, self._controller, self._calibration)
+        self._run = VirtualRun(plant, self._controller)
         self._ticks = self._run.ticking()
         return self.step()
 

@@ -152,7 +152,6 @@ class VirtualRun:
 
     plant: EmulatedHand  # a new one, before its first trial
     controller: Controller  # warmed; it is restarted
-    calibration: Calibration  # of this hand
     command: float = 0.5  # grip command in [0, 1]
     limits: SafetyConfig = SafetyConfig()  # of the bridge's safety
 
@@ -164,7 +163,7 @@ class VirtualRun:
         self._trial = plant.trial
         self.safety = Safety(controller.hand, limits_for(self.limits, controller))
         self.port = port = VirtualPort(plant)
-        sensing = HandSensing(controller.hand, HardwareConfig(), self.calibration)
+        sensing = HandSensing(controller.hand, HardwareConfig(), ideal_calibration(controller.hand))
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
         objects = ObjectSensors(np.asarray(controller.spec.reference, float))
         objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None

@@ -211,7 +211,7 @@ class EmulatedHand:
             shape = sample_shape(parameters, rng, self.shape_name)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
-            self._palm_face = palm_face(scene, tuple(self.start.place)) if self._model.foreign else own
+            self._palm_face = palm_face(scene, self.start.place[-2:]) if self._model.foreign else own
             place = find_place(scene, parameters, shape, rng, self._palm_face, self.start)
             if place is not None:
                 break

@@ -13,6 +13,7 @@ import pytest
 from paths import ROOT
 
 import dexsim_real.twin.plant
+from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.objects import CLEARANCE
@@ -72,8 +73,8 @@ def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_
 
 def test_a_cube_between_the_fingertips_is_put_where_they_carry_it(hand):
     """A millimetre lower it would overlap with them."""
-    for trial in range(3):
-        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial)
+    for trial, model in enumerate((None, None, asset_path("plants/foreign_right.xml"))):
+        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial, plant_model=model)
         place, scene, data = plant._place, plant._scene, mujoco.MjData(plant._scene.model)
         scene.set_joints(data, plant.start.posture)
         at, lower = place.position, place.position - 0.001 * plant.up
