@@ -67,26 +67,24 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
 
 
+BALL = """<mujoco>
+  <option timestep="{}" gravity="0 0 -{}" cone="elliptic" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <geom name="floor" type="box" size="1 1 .1" pos="0 0 -.1"/>
+    <body pos="0 0 .03"><freejoint/><geom name="ball" size=".03" mass=".1"/></body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="ball" condim="4"/></contact>
+</mujoco>"""
+
+
 @pytest.mark.parametrize("stiffness", [1700.0, 8000.0])
 def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
     def drop(speed, gravity):
-        spec = mujoco.MjSpec()
-        spec.option.timestep, spec.option.gravity = scene.TIMESTEP, [0, 0, -gravity]
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.worldbody.add_geom(
-            name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1], contype=0, conaffinity=0
-        )
-        body = spec.worldbody.add_body(pos=[0, 0, 0.03])
-        body.add_freejoint()
-        body.add_geom(
-            name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.1, contype=0, conaffinity=0
-        )
-        spec.add_pair(geomname1="floor", geomname2="ball", condim=4)
-        model = spec.compile()
-        model.pair_solref[0], model.pair_solimp[0] = scene.spring(
-            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1), scene.TIMESTEP
-        )
+        model = mujoco.MjModel.from_xml_string(BALL.format(scene.TIMESTEP, gravity))
+        damping = scene.damping_of(0.08, stiffness, 0.1)
+        contact = scene.spring(model.body_invweight0[:, 0].sum(), stiffness, damping, scene.TIMESTEP)
+        model.pair_solref[0], model.pair_solimp[0] = contact
         data = mujoco.MjData(model)
         data.qvel[2] = -speed
         mujoco.mj_step(model, data, 4000)

@@ -20,19 +20,8 @@ def start(axis=X, clear=False):
 
 def seen(position, quat=(1.0, 0, 0, 0), spin=X * 0.0, force=0.0, limited=False, disturbed=False, height=0.01):
     force = np.broadcast_to(force, 5).astype(float)
-    joints = np.full(12, 0.3), np.full(12, 0.5)
-    return Look(
-        np.asarray(position, float),
-        np.asarray(quat, float),
-        spin,
-        height,
-        force,
-        0.8 * force,
-        0.5 * force,
-        *joints,
-        limited,
-        disturbed,
-    )
+    forces, joints = (force, 0.8 * force, 0.5 * force), (np.full(12, 0.3), np.full(12, 0.5))
+    return Look(np.array(position, float), np.array(quat, float), spin, height, *forces, *joints, limited, disturbed)
 
 
 def look(judge, quat, spin=X * 0.0, away=0.0, step=0.01):
