@@ -38,7 +38,7 @@ from dexsim.core.statistics import mean, proportion, ratio
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
-from dexsim.tasks.grasp.report import FORCES, reduce
+from dexsim.tasks.grasp.report import MEANS, reduce
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.control.limits import SafetyConfig
@@ -154,7 +154,7 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
       reports: the referee's, of trials.
       span: N, target at command 0 and 1.
     """
-    names = (*(f"finger_{part}" for part in FORCES.values()), "total_force", "total_torque", "torque_limited")
+    names = [name for name in MEANS if name != "touching"]
     column = {name: np.array([r[name] for r in reports], float) for name in ("command", "seconds", *names)}
     held, shapes = np.array([r["held"] for r in reports]), tuple(sorted({r["shape"] for r in reports}))
     # A referee's means end with the trial; a lost object is not pressed for the rest of the window.

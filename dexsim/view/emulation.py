@@ -52,16 +52,11 @@ class Emulation:
         self._run.policy.command = self._command.value if self._command else 0.5
         if next(self._ticks, None) is None:
             return self.reset()
-        return self._frame()
-
-    def _frame(self) -> Frame:
         plant, policy, sample = self._run.plant, self._run.policy, self._run.safety.sample
         assert sample is not None, "the policy has ticked"
         joints, position, quat = plant.true_pose()
-        parts = plant.shape.parts
-        goals, measured = policy.goals, sample.measured
-        finger_force = self._controller.spec.finger_force
-        target = np.nan if finger_force is None else np.interp(policy.command, (0, 1), finger_force)
+        parts, goals, measured = plant.shape.parts, policy.goals, sample.measured
+        target = np.interp(policy.command, (0, 1), self._controller.spec.finger_force or (np.nan, np.nan))
         snapshot = Snapshot(
             joint_position=joints,
             object_position=position,
@@ -78,5 +73,5 @@ class Emulation:
             turns=goals.successes if goals else None,
             seconds=self._run.port.time,
         )
-        command = policy.command if self._command else None
-        return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}", command)
+        kinds, command = tuple(part.kind for part in parts), policy.command if self._command else None
+        return Frame(snapshot, kinds, f"trial {self._trial}", command)
