@@ -72,7 +72,7 @@ BUDGETS = {
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_150,  # goal: 1,900
     "dexsim_ppo": 4_100,  # goal: 4,000
     "dexsim_real": 8_885,  # goal: 6,500
-    "benchmarks": 2_110,
+    "benchmarks": 2_090,
     "tests": 21_640,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
