@@ -1,10 +1,9 @@
-"""The engines side by side: motions against C MuJoCo in double precision, and what the shipped policies reach.
+"""The engines side by side: motions against C MuJoCo in double precision.
 
-    python benchmarks/engines.py motions --json motions.json    # grips, slides, rolling, drops of each shape
-    python benchmarks/engines.py policies                       # success of the shipped policies
+    python benchmarks/engines.py --json motions.json
 
-One JSON line a row, and a table at the end with a column for each engine that this machine can run: `c` on a CPU,
-`cuda` on an NVIDIA GPU, `mjx` on both.
+One JSON line a row, and tables at the end with a column for each engine that this machine can run: `c` on a CPU,
+`cuda` on an NVIDIA GPU, `mjx` on both. What policies reach on an engine: `python -m dexsim_ppo.evaluate --backend`.
 
 | motion | begins | gravity |
 |---|---|---|
@@ -35,7 +34,6 @@ import numpy as np
 import dexsim
 from dexsim.core import cli
 from dexsim.core.compilation import jit
-from dexsim.core.config import override
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
@@ -46,12 +44,10 @@ from dexsim.physics.model import build_scene
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
 from dexsim.registry import TASKS
 from dexsim.tasks.shared import palm_height
-from dexsim_ppo import evaluate_policy, load_policy
 
 MOTIONS = ("grip", "slide", "roll", "drop")
 STIFFNESS, DAMPING, REACH = 3.0, 0.1, 0.3  # Nm/rad, Nm s/rad, rad
 TOUCHING = 0.01  # N
-MEASURES = ("held", "r_resultant", "force_error_n", "successes_per_minute", "kept_to_the_end")  # of policies
 GAP = 1e-4  # m between palm and object: without one the first contact hangs on the last digit
 NUDGE = 1e-6  # m, and of each part of the quaternion
 CLOSING, TRIES = 100, 6  # sub-steps in which fingers close for a grip, and attempts with one object
@@ -277,69 +273,15 @@ class Motions:
         return rows
 
 
-def policy_row(name: str, backend: str, episodes: int, seconds: float) -> dict[str, Any]:
-    """What a shipped policy reaches in the same episodes on an engine; `seconds` 0 for the task's own length."""
-    policy = load_policy(name)
-    changes = [f"pool_size={max(episodes, 64)}"] + [f"evaluation_seconds={seconds}"] * bool(seconds)
-    policy = dataclasses.replace(policy, env_config=override(policy.env_config, changes))
-    env = policy.make_env(backend=backend)
-    task = evaluate_policy(policy, env=env, episodes=episodes, chunk=episodes, baseline=False)["task"]
-    row = {"policy": name, "backend": backend, "episodes": episodes, "seconds": task["seconds"]}
-    for key in MEASURES:
-        if key in task:
-            row[key] = task[key]["r" if key == "r_resultant" else "mean"]
-            row[f"{key}_ci95"] = [task[key]["low"], task[key]["high"]]
-    return row | {"non_finite": task["non_finite"]}
-
-
-def motions(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The command `motions`."""
-    rows = []
-    for task in options.tasks:
-        bench = Motions(task, options.starts, options.seconds)
-        reference = bench.reference()
-        for engine in ("nudged", *options.backends):
-            found = bench.reference(NUDGE) if engine == "nudged" else bench.run(engine)
-            for row in bench.compare(found, reference):
-                rows.append({"backend": engine} | row)
-                show(rows[-1])
-    for title, name in (("object's place, mm", "place_mm"), ("forces, N", "force_error_n")):
-        cells = [
-            (f"{r['motion']}, {r['shape']}", r["backend"], f"{r[name + '_p95']:.2g} / {r[name + '_max']:.2g}")
-            for r in rows
-        ]
-        print(table(f"{title}: 95 % / largest", cells))
-    return rows
-
-
-def policies(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The command `policies`."""
-    rows, cells = [], []
-    for name in options.policies:
-        for backend in options.backends:
-            row = policy_row(name, backend, options.episodes, options.seconds)
-            rows.append(row)
-            show(row)
-            for key in MEASURES:
-                if row.get(key) is not None:
-                    low, high = row[f"{key}_ci95"]
-                    cells.append((f"{name}, {key}", backend, f"{row[key]:.3g} ({low:.3g}–{high:.3g})"))
-    print(table("policy", cells))
-    return rows
-
-
-def show(row: dict[str, Any]) -> None:
-    """A JSON line."""
-    rounded = {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
-    print(json.dumps(rounded), flush=True)
-
-
-def table(title: str, cells: list[tuple[str, str, str]]) -> str:
-    """Markdown of (row, column, text)."""
-    rows, columns = (list(dict.fromkeys(x)) for x in list(zip(*cells, strict=True))[:2])
-    texts = {(row, column): text for row, column, text in cells}
-    lines = [[title, *columns], ["---"] * (1 + len(columns))]
-    lines += [[row, *(texts.get((row, column), "") for column in columns)] for row in rows]
+def table(rows: list[dict[str, Any]], title: str, name: str) -> str:
+    """Markdown with a line a motion and a column an engine: 95th percentile and maximum of a measure."""
+    cells: dict[str, dict[str, str]] = {}
+    for row in rows:
+        line = cells.setdefault(f"{row['task']}: {row['motion']}, {row['shape']}", {})
+        line[row["backend"]] = f"{row[name + '_p95']:.2g} / {row[name + '_max']:.2g}"
+    engines = next(iter(cells.values())).keys()
+    lines = [[f"{title}: 95 % / largest", *engines], ["---"] * (1 + len(engines))]
+    lines += [[motion, *line.values()] for motion, line in cells.items()]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
@@ -354,24 +296,23 @@ def usable() -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    parser, engines = argparse.ArgumentParser(description=__doc__.splitlines()[0]), usable()
-    commands = parser.add_subparsers(required=True)
-    command = commands.add_parser("motions")
-    command.set_defaults(run=motions)
-    command.add_argument("--tasks", nargs="+", default=["grasp", "rotate"])
-    command.add_argument("--starts", type=int, default=4, help="of each motion and shape")
-    command.add_argument("--seconds", type=float, default=0.6)
-    command = commands.add_parser("policies")
-    command.set_defaults(run=policies)
-    command.add_argument("--policies", nargs="+", default=["grasp", "rotate"])
-    command.add_argument("--episodes", type=int, default=64)
-    command.add_argument("--seconds", type=float, default=0.0, help="length of an episode; 0 for the task's own")
-    for command in commands.choices.values():
-        command.add_argument("--backends", nargs="+", default=engines, choices=engines)
-        command.add_argument("--json", type=Path, help="file for all rows")
+    parser, engines, rows = argparse.ArgumentParser(description=__doc__.splitlines()[0]), usable(), []
+    parser.add_argument("--tasks", nargs="+", default=["grasp", "rotate"])
+    parser.add_argument("--starts", type=int, default=4, help="of each motion and shape")
+    parser.add_argument("--seconds", type=float, default=0.6)
+    parser.add_argument("--backends", nargs="+", default=engines, choices=engines)
+    parser.add_argument("--json", type=Path, help="file for all rows")
     options = parser.parse_args(argv)
     cli.enable_caches()
-    rows = options.run(options)
+    for task in options.tasks:
+        bench = Motions(task, options.starts, options.seconds)
+        reference = bench.reference()
+        for engine in ("nudged", *options.backends):
+            found = bench.reference(NUDGE) if engine == "nudged" else bench.run(engine)
+            for row in bench.compare(found, reference):
+                rows.append({"backend": engine} | row)
+                print(json.dumps(rows[-1]), flush=True)
+    print(table(rows, "object's place, mm", "place_mm"), table(rows, "forces, N", "force_error_n"), sep="\n")
     if options.json:
         cli.write_json(options.json, {"rows": rows} | cli.environment_report())
     return 0

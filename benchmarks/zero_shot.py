@@ -16,64 +16,60 @@ import concurrent.futures
 import dataclasses
 import functools
 import itertools
+import json
 import multiprocessing
 import multiprocessing.connection
 import os
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
-from zero_shot_metrics import draw_losses, metrics, simulated, table
 
 from dexsim.core import cli
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import DexsimError
+from dexsim.core.statistics import mean, proportion, ratio
+from dexsim.hand.description import Hand
+from dexsim.hand.load import load_hand
+from dexsim.render.snapshot import Snapshot
+from dexsim.tasks.grasp.report import MEANS, reduce
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import KINDS, TASKS, sample_trial
+from dexsim_real.twin.plant.shapes import SHAPES, matrix
+from dexsim_real.twin.virtual import VirtualRun
 
-TARGETS = {
-    "grasp": "held 90 %, r 0.8",
-    "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall",
-    "rotate_any": "40 successes",
-    "rotate_clear": "none",
-}
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @functools.lru_cache(maxsize=2)
-def load(name: str, idle: bool, hand_name: str = "") -> tuple[Any, Any, Any]:
-    """Hand, controller and calibration; loaded once per process. An idle policy's actions are zero."""
-    from dexsim_real.control.controller import Controller, prepare_jax
-
+def load(name: str, idle: bool, hand: str = "") -> Controller:
+    """The controller of a policy; loaded once per process. An idle policy's actions are zero."""
     prepare_jax()
-    import jax
-
-    from dexsim import load_hand
-    from dexsim_ppo.policy import load_policy
-    from dexsim_real.twin.virtual import ideal_calibration
-
-    hand, policy = load_hand(hand_name), load_policy(name)
+    policy = load_policy(name)
     if idle:
         layers = jax.tree.map(np.zeros_like, policy.params.layers)
         policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=layers))
-    controller = Controller(policy, hand)
+    controller = Controller(policy, load_hand(hand))
     controller.warm()
-    return hand, controller, ideal_calibration(hand)
+    return controller
 
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """One trial: the referee's report, with the bridge's measurements as `bridge`."""
-    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-    from dexsim_real.twin.plant.shapes import SHAPES
-    from dexsim_real.twin.virtual import VirtualRun
-
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    hand, controller, calibration = load(options["policy"], options.get("idle", False), options.get("hand", ""))
+    controller = load(options["policy"], options.get("idle", False), options.get("hand", ""))
     plant = EmulatedHand(
-        hand,
+        controller.hand,
         options["task"],
         seed,
         kind=options["parameters"],
@@ -85,9 +81,9 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         plant_model=options.get("plant_model"),
     )
     began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
-    run = VirtualRun(plant, controller, calibration, command, limits)
+    run = VirtualRun(plant, controller, command, limits)
     trace = [
-        (time, tick.readings.joint_torque[hand.root_joint], run.policy.sample.measured.finger_force)
+        (time, tick.readings.joint_torque[plant.hand.root_joint], run.policy.sample.measured.finger_force)
         for time, tick in run.ticking()
     ]
     report = run.report()
@@ -147,6 +143,138 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
     return report
 
 
+# --- metrics and tables ---------------------------------------------------------------------------------
+
+
+def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
+    """The metrics of the evaluation in simulation (`dexsim.tasks.grasp.report`); torques are as the bridge measures
+    them.
+
+    Args:
+      reports: the referee's, of trials.
+      span: N, target at command 0 and 1.
+    """
+    names = [name for name in MEANS if name != "touching"]
+    column = {name: np.array([r[name] for r in reports], float) for name in ("command", "seconds", *names)}
+    held, shapes = np.array([r["held"] for r in reports]), tuple(sorted({r["shape"] for r in reports}))
+    # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
+    start, end = np.array([r["window_s"] for r in reports], float).T
+    lived = np.where(held, 1.0, np.clip((column["seconds"] - start) / (end - start), 0.0, 1.0))
+    means, shape = {name: lived * column[name] for name in names}, np.array([shapes.index(r["shape"]) for r in reports])
+    window = {"window_s": [float(start.min()), float(end.max())]}
+    return reduce(column["command"], held, shape, means, span, shapes) | window
+
+
+def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """The paper's three metrics, with goals counted by the task's rule (spin limit) and by the paper's.
+
+    The pace is over all the time that trials lasted, time in which the hand was stuck included.
+    """
+    count, paper, lived = (
+        np.array([r[name] for r in reports], float) for name in ("successes", "paper_successes", "seconds_to_fall")
+    )
+    return {
+        "successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
+        "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
+        "successes_per_minute": ratio(count, lived / 60),
+        "seconds_to_fall": mean(lived),
+        "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
+        "joint_speed": mean(np.array([r["joint_speed"] for r in reports])),
+    }
+
+
+def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """The metrics of a policy's trials, with a count of the causes of losses."""
+    causes = Counter(r["end"].removeprefix("dropped: ") for r in reports if r["end"].startswith("dropped"))
+    lost = {"lost": dict(causes.most_common())}
+    if task != "grasp":
+        return rotate_metrics(reports) | lost
+    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"])) | lost
+
+
+def draw_losses(folder: Path, hand: Hand, reports: list[dict[str, Any]]) -> list[Path]:
+    """A picture of the first loss of each cause, half a second before its end: the library's hand at the true joint
+    angles, with the true object."""
+    from PIL import Image
+
+    from dexsim.render.render import render_frame
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for report in reports:
+        cause = report["end"].removeprefix("dropped: ").replace(" ", "_")
+        path = folder / f"{report['task']}_{cause}.png"
+        if "before" not in report or path in paths:
+            continue
+        parts, before = report["parts"], report["before"]
+        size = np.zeros((len(parts), 3))
+        for row, part in zip(size, parts, strict=True):
+            row[: len(part["size"])] = part["size"]
+        snapshot = Snapshot(
+            joint_position=np.array(before["joint_position"]),
+            object_position=np.array(before["object_position"]),
+            object_rotation=matrix(np.array(before["object_quat"])),
+            primitive_size=size,
+            primitive_position=np.array([part["place"] for part in parts]),
+            primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
+            primitive_active=np.ones(len(parts), bool),
+            taxel_force=np.zeros((hand.num_fingers, hand.num_taxels)),
+            command=np.float32(report["command"]),
+            target_force=np.float32(0),
+            finger_force=np.array(before["finger_force"]),
+        )
+        picture = render_frame(hand, tuple(part["kind"] for part in parts), snapshot, camera=report["task"])
+        Image.fromarray(picture).save(path)
+        paths.append(path)
+    return paths
+
+
+def simulated(task: str, policy: str) -> dict[str, Any]:
+    """The policy's report in simulation; empty if there is none."""
+    path = Path(policy).with_suffix(".json")
+    try:
+        path = path if path.is_file() else asset_path(f"policies/{Path(policy).stem}.json")
+        report = json.loads(path.read_text())
+        report = report.get("evaluation", report["trained"])["task"]
+    except (OSError, KeyError, ValueError, DexsimError):
+        return {}
+    counts = () if task == "grasp" else ("successes", "paper_successes")
+    return report | {name: report[name]["mean"] | {"median": report[name]["median"]["median"]} for name in counts}
+
+
+def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> str:
+    """Table with the columns metric, emulated hand, simulation, and a hand that does nothing in the same trials."""
+
+    def cell(entry: Any) -> str:
+        value = entry.get("r", entry.get("mean")) if isinstance(entry, dict) else None
+        if value is None:
+            return "-"
+        span = f" ({entry['low']:.3g} to {entry['high']:.3g})" if entry.get("low") is not None else ""
+        return f"{value:.3g}{span}" + (f", median {entry['median']:.3g}" if "median" in entry else "")
+
+    def line(title: str, name: str, *entries: dict[str, Any]) -> tuple[str, ...]:
+        return (title + name.replace("_", " "), *(cell(entry.get(name)) for entry in entries))
+
+    worlds = here, there, idle
+    rows = [("", "emulated hand", "simulation", "doing nothing")]
+    rows += [line("", name, *worlds) for name in here if isinstance(here[name], dict) and name != "lost"]
+    for row in here.get("by_command", []):
+        same = [next((r for r in w.get("by_command", []) if r["command"] == row["command"]), {}) for w in worlds]
+        title = f"command {row['command']:g}{' (saturates)' if row['saturates'] else ''}: "
+        rows += [line(title, name, *same) for name in ("held", "finger_force_n", "torque_limited")]
+    rows += [(f"{row['shape']}: held", cell(row["held"]), "", "") for row in here.get("by_shape", [])]
+    widths = [max(len(row[k]) for row in rows) for k in range(4)]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if here.get("lost"):
+        lines.append("lost: " + ", ".join(f"{cause} {count}" for cause, count in here["lost"].items()))
+    if "window_s" in here:
+        lines.append("forces and r: of held objects, from {:g} to {:g} s after release".format(*here["window_s"]))
+    return "\n".join(lines)
+
+
+# --- the command ----------------------------------------------------------------------------------------
+
+
 def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The options, checked before the first trial; `set` and `limit` are tables from name to value.
 
@@ -181,10 +309,6 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     SafetyConfig(**given.limit)
     if given.json:
         cli.check_writable(given.json)  # All trials would be lost.
-
-    from dexsim_ppo.policy import load_policy
-    from dexsim_real.control.controller import prepare_jax
-
     prepare_jax()  # As the trials need it, before anything is computed.
     load_policy(given.policy, task=given.task)
     return given
@@ -220,10 +344,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
         cli.write_json(json, found | cli.environment_report())
     seeds = " ".join(map(str, options["seed"]))
-    print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}; targets {TARGETS[task]}")
+    print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}")
     print(table(here, there, idle))
     if pictures:
-        print(*draw_losses(pictures, load(policy, False, options.get("hand", ""))[0], reports), sep="\n")
+        print(*draw_losses(pictures, load(policy, False, options["hand"]).hand, reports), sep="\n")
     return 0
 
 

@@ -29,22 +29,15 @@ class Budget:
     level: int
     preset: str = "cpu"
     backend: str = "c"
+    # By skill: options of the training command for one seed. Empty: shipped policies stand in, nothing is trained.
     training: dict[str, dict[str, float]]
-    """Options of the training command for one seed, by skill. Empty: shipped policies stand in, nothing is trained."""
-    learner: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
-    """Changes to the preset's PPO settings, by skill."""
-    episodes: dict[str, int]
-    """Evaluation in simulation, by skill."""
-    trials: dict[str, int]
-    """On the emulated hand, for each seed."""
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Length of an evaluation and of a trial; the task's own where missing."""
-    sweep: dict[str, Any]
-    """Points of each row (0: training's ranges alone, 2: the ends); episodes and seconds by skill."""
-    objects: int
-    """Evaluation episodes of each held-out object."""
-    processes: int = 1
-    """For trials. A GPU needs more than one: the bridge's JAX is on the CPU."""
+    learner: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)  # changes to the preset's PPO
+    episodes: dict[str, int]  # of an evaluation in simulation
+    trials: dict[str, int]  # on the emulated hand, for each seed
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # of evaluations, trials; else the task's own
+    sweep: dict[str, Any]  # points of each row (0: training's ranges alone, 2: the ends); episodes and seconds by skill
+    objects: int  # evaluation episodes of each held-out object
+    processes: int = 1  # for trials; a GPU needs more than one: the bridge's JAX is on the CPU
 
 
 BUDGETS = {
@@ -95,23 +88,15 @@ BUDGETS["long"] = dataclasses.replace(
 class Row:
     """One configuration of a table."""
 
-    name: str
-    """Folder of its report."""
+    name: str  # folder of its report
     label: str
-    task: str = ""
-    """Registered task that it trains or measures."""
-    settings: tuple[str, ...] = ()
-    """Changes to the task's configuration, as `--set` of the evaluation command takes them."""
-    policy: str = ""
-    """Shipped policy that is measured."""
-    ablate: tuple[str, ...] = ()
-    """Observation fields that the policy does without."""
-    points: tuple[float, ...] = ()
-    """Of a sweep, in order."""
-    plant: tuple[str, ...] = ()
-    """Parameters of the emulated hand that are not drawn, such as edge=0.055."""
-    paper: dict[str, str] = dataclasses.field(default_factory=dict)
-    """The paper's numbers, by column."""
+    task: str = ""  # registered task that it trains or measures
+    settings: tuple[str, ...] = ()  # changes to the task's configuration, as `--set` of the evaluation takes them
+    policy: str = ""  # shipped policy that is measured
+    ablate: tuple[str, ...] = ()  # observation fields that the policy does without
+    points: tuple[float, ...] = ()  # of a sweep, in order
+    plant: tuple[str, ...] = ()  # parameters of the emulated hand that are not drawn, such as edge=0.055
+    paper: dict[str, str] = dataclasses.field(default_factory=dict)  # the paper's numbers, by column
 
     @property
     def skill(self) -> str:
@@ -131,12 +116,9 @@ class Experiment:
     title: str
     rows: tuple[Row, ...]
     measure: Measure
-    table: Callable[["Experiment", dict[str, dict]], list[list[str]]]
-    """Header and rows, from the reports by row."""
-    draw: Callable[["Experiment", dict[str, dict], Path], None] | None = None
-    """Writes figures into a folder."""
-    training_seeds: int = 0
-    """Training runs of each row; 0: nothing is trained."""
+    table: Callable[["Experiment", dict[str, dict]], list[list[str]]]  # header and rows, from the reports by row
+    draw: Callable[["Experiment", dict[str, dict], Path], None] | None = None  # writes figures into a folder
+    training_seeds: int = 0  # training runs of each row; 0: nothing is trained
 
     def seeds(self, budget: Budget) -> range:
         """Seeds of each row; what is not trained has one."""

@@ -42,68 +42,48 @@ def _observation_rows(task: str) -> tuple[Row, ...]:
     )
 
 
-def _sweep_rows() -> tuple[Row, ...]:
-    """The rows of both skills. With a range of training the points are its ends and those of a range twice as wide."""
-    friction = ("friction", "finger friction", "objects.friction=[{},{}]", points_at_twice(0.4, 1.2, floor=0.02))
-    shared = (
-        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.01, 0.02, 0.03)),
-        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", points_at_twice(0.9, 1.1)),
-        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", (0.0, 0.01, 0.02, 0.04)),
-        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", (0.0, 0.05, 0.1, 0.2)),
-        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.05, 0.1, 0.2)),
-        friction,
-    )
-    link, mass, error = "objects.link_friction=[{},{}]", "objects.mass=[{},{}]", "orientation error, at most [rad]"
-    own = {
-        "grasp": (
-            ("link_friction", "link friction", link, points_at_twice(0.3, 1.2, floor=0.02)),
-            ("mass", "mass [kg]", mass, points_at_twice(0.05, 0.20, floor=0.02)),
-        ),
-        "rotate": (
-            # Below 0.1 hardly a cube stays on the palm to begin with.
-            ("link_friction", "link friction", link, (0.1, 0.3, 0.9, 1.2)),
-            ("mass", "mass [kg]", mass, points_at_twice(0.06, 0.15, floor=0.02)),
-            ("orientation", error, "sensing.orientation.bias={}", (0.0, 0.02, 0.04, 0.08)),
-            ("edge", "cube edge [m]", "edge=[{},{}]", points_at_twice(0.050, 0.060)),
-        ),
-    }
-    rows = []
-    for skill, sweeps in own.items():
-        rows.append(Row(name=f"{skill}_reference", label=f"{skill}: training's ranges", task=skill, policy=skill))
-        for name, label, setting, points in (*shared, *sweeps):
-            # Few small cubes stay in the hand: a pool that they can fill.
-            settings = (setting, "pool_size=256") if name == "edge" else (setting,)
-            about = {"name": f"{skill}_{name}", "label": f"{skill}: {label}", "task": skill, "policy": skill}
-            rows.append(Row(settings=settings, points=points, **about))
-    return tuple(rows)
+_SWEEPS = (
+    # skills, name, label, setting, points; with a range of training its ends and those of a range twice as wide
+    ("grasp rotate", "latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.01, 0.02, 0.03)),
+    ("grasp rotate", "torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", points_at_twice(0.9, 1.1)),
+    ("grasp rotate", "taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", (0.0, 0.01, 0.02, 0.04)),
+    ("grasp rotate", "dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", (0.0, 0.05, 0.1, 0.2)),
+    ("grasp rotate", "lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.05, 0.1, 0.2)),
+    ("grasp rotate", "friction", "finger friction", "objects.friction=[{},{}]", points_at_twice(0.4, 1.2, floor=0.02)),
+    ("grasp", "link_friction", "link friction", "objects.link_friction=[{},{}]", points_at_twice(0.3, 1.2, floor=0.02)),
+    ("grasp", "mass", "mass [kg]", "objects.mass=[{},{}]", points_at_twice(0.05, 0.20, floor=0.02)),
+    # Below 0.1 hardly a cube stays on the palm to begin with.
+    ("rotate", "link_friction", "link friction", "objects.link_friction=[{},{}]", (0.1, 0.3, 0.9, 1.2)),
+    ("rotate", "mass", "mass [kg]", "objects.mass=[{},{}]", points_at_twice(0.06, 0.15, floor=0.02)),
+    (
+        "rotate",
+        "orientation",
+        "orientation error, at most [rad]",
+        "sensing.orientation.bias={}",
+        (0.0, 0.02, 0.04, 0.08),
+    ),
+    ("rotate", "edge", "cube edge [m]", "edge=[{},{}]", points_at_twice(0.050, 0.060)),
+)
 
 
-_RANGES = {
-    "both": ("44.50–93.92", "1.09–1.52"),
-    "force": ("37.29–70.02", "0.69–0.75"),
-    "torque": ("38.45–47.12", "0.85–1.02"),
-}
-"""The paper's: of the contact force [N], and of the joint torque."""
+def _sweep_rows() -> Iterator[Row]:
+    """The rows of both skills."""
+    for skill in ("grasp", "rotate"):
+        yield Row(name=f"{skill}_reference", label=f"{skill}: training's ranges", task=skill, policy=skill)
+        for skills, name, label, setting, points in _SWEEPS:
+            if skill in skills:
+                # Few small cubes stay in the hand: a pool that they can fill.
+                settings = (setting, "pool_size=256") if name == "edge" else (setting,)
+                about = {"name": f"{skill}_{name}", "label": f"{skill}: {label}", "task": skill, "policy": skill}
+                yield Row(settings=settings, points=points, **about)
 
 
-def _reward_rows() -> tuple[Row, ...]:
-    """The paper's reward, and without either of its halves."""
-    rows = (
-        ("both", "R_force and R_torque", ()),
-        ("force", "R_force alone", ("reward.torque=0",)),
-        ("torque", "R_torque alone", ("reward.force=0",)),
-    )
-    return tuple(
-        Row(
-            name=name,
-            label=label,
-            task="grasp_paper",
-            settings=settings,
-            paper=dict(zip(("force range [N]", "torque range"), _RANGES[name], strict=True)),
-        )
-        for name, label, settings in rows
-    )
-
+_REWARDS = (
+    ("both", "R_force and R_torque", (), "44.50–93.92", "1.09–1.52"),
+    ("force", "R_force alone", ("reward.torque=0",), "37.29–70.02", "0.69–0.75"),
+    ("torque", "R_torque alone", ("reward.force=0",), "38.45–47.12", "0.85–1.02"),
+)
+"""The paper's, and without either of its halves; its ranges of the contact force [N] and of the joint torque."""
 
 _READINGS = (
     ("nothing", "nothing ablated", ()),
@@ -176,7 +156,16 @@ _ALL = (
     Experiment(
         name="exact_rewards",
         title="Rewards of the grasp, the paper's task exactly",
-        rows=_reward_rows(),
+        rows=tuple(
+            Row(
+                name=name,
+                label=label,
+                task="grasp_paper",
+                settings=settings,
+                paper={"force range [N]": force, "torque range": torque},
+            )
+            for name, label, settings, force, torque in _REWARDS
+        ),
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
@@ -233,7 +222,7 @@ _ALL = (
     Experiment(
         name="robustness",
         title="Success beyond the ranges of training",
-        rows=_sweep_rows(),
+        rows=tuple(_sweep_rows()),
         measure=measure.swept,
         table=tables.sweeps,
     ),

@@ -67,15 +67,15 @@ def touch_map(experiment: Experiment, reports: Reports, folder: Path) -> None:
 def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> None:
     """Force and torque over the command in both worlds: means with bands."""
     figure, axes = _subplots(1, 3, 3.4, 3.0)
-    names = (
-        ("finger force [N]", "finger_force_n", "finger_force"),
-        ("total force [N]", "total_force_n", "total_force"),
-        ("total torque [share of the limit]", "total_torque", "total_torque"),
-    )
-    for axis, (label, *keys) in zip(axes[0], names, strict=True):
+    names = {
+        "finger_force_n": "finger force [N]",
+        "total_force_n": "total force [N]",
+        "total_torque": "total torque [share of the limit]",
+    }
+    for axis, (name, label) in zip(axes[0], names.items(), strict=True):
         for color, row in zip(COLORS, experiment.rows, strict=False):
             for world, style in (("simulation", "-"), ("hand", "--")):
-                command, middle, low, high = _curve(seeds(reports.get(row.name)), world, keys)
+                command, middle, low, high = _curve(seeds(reports.get(row.name)), world, name)
                 if len(command):
                     text = f"{row.label}, {'emulated hand' if world == 'hand' else world}"
                     axis.plot(command, middle, style, color=color, lw=1.5, label=text)
@@ -86,22 +86,14 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
     _save(figure, folder / "force_and_torque.svg")
 
 
-def _curve(results: list[dict[str, Any]], world: str, keys: list[str]) -> tuple[np.ndarray, ...]:
+def _curve(results: list[dict[str, Any]], world: str, name: str) -> tuple[np.ndarray, ...]:
     """Commands, mean, lower and upper end of the band: the interval of one seed, the span of several."""
-    tables = [
-        [(row["command"], next(row[key] for key in keys if key in row)) for row in seed[world]["by_command"]]
-        for seed in results
-    ]
-    if not tables:
+    rows = [seed[world]["by_command"] for seed in results]
+    if not rows:
         return (np.zeros(0),) * 4
-    command = np.array([c for c, _ in tables[0]])
-    values = np.array(
-        [
-            [[entry[name] if entry[name] is not None else np.nan for name in ("mean", "low", "high")] for _, entry in t]
-            for t in tables
-        ]
-    )
-    middle = values[..., 0].mean(0)
-    if len(tables) > 1:
-        return command, middle, values[..., 0].min(0), values[..., 0].max(0)
-    return command, middle, values[0, :, 1], values[0, :, 2]
+    command = np.array([row["command"] for row in rows[0]])
+    # [seeds, commands] each; None becomes NaN.
+    mean, low, high = (np.array([[r[name][k] for r in seed] for seed in rows], float) for k in ("mean", "low", "high"))
+    if len(rows) > 1:
+        return command, mean.mean(0), mean.min(0), mean.max(0)
+    return command, mean[0], low[0], high[0]

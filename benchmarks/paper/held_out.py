@@ -30,19 +30,15 @@ HEAVY = {"ingot": (0.25, 0.35), "spool": (0.25, 0.35), "anvil": (0.25, 0.35), "m
 
 def shape_of(name: str) -> dict[str, np.ndarray]:
     """An object in our slots: size [K, 3], position [K, 3], quat [K, 4], active [K], inertia [3]."""
-    free, shape = (
-        list(range(len(SLOTS))),
-        {
-            "size": np.full((len(SLOTS), 3), INACTIVE_SIZE, np.float32),
-            "position": np.zeros((len(SLOTS), 3), np.float32),
-            "quat": np.tile(np.float32([1, 0, 0, 0]), (len(SLOTS), 1)),
-            "active": np.zeros(len(SLOTS), bool),
-            "inertia": np.float32(CATALOGUE[name]["inertia"]),
-        },
-    )
+    shape = {
+        "size": np.full((len(SLOTS), 3), INACTIVE_SIZE, np.float32),
+        "position": np.zeros((len(SLOTS), 3), np.float32),
+        "quat": np.tile(np.float32([1, 0, 0, 0]), (len(SLOTS), 1)),
+        "active": np.zeros(len(SLOTS), bool),
+        "inertia": np.float32(CATALOGUE[name]["inertia"]),
+    }
     for part in CATALOGUE[name]["parts"]:
-        slot = next(slot for slot in free if SLOTS[slot] == part["kind"])
-        free.remove(slot)
+        slot = next(k for k, kind in enumerate(SLOTS) if kind == part["kind"] and not shape["active"][k])
         shape["active"][slot] = True
         for field in ("size", "position", "quat"):
             shape[field][slot] = part[field]
@@ -50,18 +46,12 @@ def shape_of(name: str) -> dict[str, np.ndarray]:
 
 
 class HeldOutGrasp(Grasp):
-    """The grasp with objects of the catalogue.
-
-    Args:
-      config: of the grasp; its shapes and sizes are not used.
-      hand: the hand.
-      names: of the objects.
-    """
+    """The grasp with the named objects of the catalogue; shapes and sizes of the configuration are not used."""
 
     def __init__(self, config: GraspConfig, hand: Hand, names: tuple[str, ...] = NAMES):
         super().__init__(config, hand)
         shapes = [shape_of(name) for name in names]
-        self.shape_names = self.names = names
+        self.shape_names = names
         self.slots = SLOTS
         self._table: Any = {field: np.stack([shape[field] for shape in shapes]) for field in shapes[0]}
         self.largest = self._table["size"].max(0)
@@ -72,12 +62,12 @@ class HeldOutGrasp(Grasp):
     @property
     def drawn_shapes(self) -> tuple[str, ...]:
         """All of the catalogue."""
-        return self.names
+        return self.shape_names
 
     def sample_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object, of a random or the given index of the catalogue."""
         if shape_index is None:
-            shape_index = jax.random.randint(jax.random.fold_in(key, 3), (), 0, len(self.names))
+            shape_index = jax.random.randint(jax.random.fold_in(key, 3), (), 0, len(self.shape_names))
         base = sample_object(jax.random.fold_in(key, 1), config.objects, jnp.int32(SHAPES.index("box")))
         rows = {name: jnp.asarray(table)[shape_index] for name, table in self._table.items()}
         low, high = jnp.asarray(self._mass)[shape_index]

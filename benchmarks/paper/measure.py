@@ -4,11 +4,17 @@ import dataclasses
 import functools
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import zero_shot
+
+import dexsim
 from dexsim.core.config import from_dict, override, to_dict
+from dexsim.env.env import Env
 from dexsim.registry import find_task
+from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy, train_policy
 from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
@@ -16,6 +22,7 @@ from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
 from dexsim_real.twin.plant.parameters import skill_of
 from paper.data import BUDGETS, ROOT, Budget, Measure, Row
+from paper.held_out import NAMES, HeldOutGrasp
 
 HELD_OUT_POOL = 480
 FOREIGN = str(ROOT / "assets" / "plants" / "foreign_right.xml")
@@ -24,14 +31,21 @@ NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
 
 
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """Train a seed of a row, or finish its training; then measure the policy in both worlds.
+    """Train a seed of a row, or finish its training; then measure the policy in both worlds, and of a row that says
+    what the emulated hand draws on a foreign plant as well.
 
     A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
-    if not budget.training:
-        return _both_worlds(row, row.skill, seed, budget) | {"training": None}
-    file, training = train(row, seed, budget, work)
-    return _both_worlds(row, str(file), seed, budget) | {"training": training}
+    policy, training = train(row, seed, budget, work) if budget.training else (row.skill, None)
+    task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.skill
+    given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
+    report = {
+        "simulation": simulate(load_policy(policy), (), budget),
+        "hand": trials(task, policy, seed, budget.name, given),
+    }
+    if row.plant:
+        report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
+    return report | {"training": training}
 
 
 def measured(*worlds: str) -> Measure:
@@ -44,8 +58,7 @@ def measured(*worlds: str) -> Measure:
         if "simulation" in worlds:
             policy = load_policy(row.policy)
             policy = policy.ablate(*row.ablate) if row.ablate else policy
-            seconds = budget.seconds.get(row.skill)
-            report["simulation"] = simulate(policy, row.settings, budget.episodes[row.skill], seconds, budget, seed)
+            report["simulation"] = simulate(policy, row.settings, budget)
         if "hand" in worlds:
             report["hand"] = trials(row.skill, row.policy, seed, budget.name)
         return report
@@ -53,21 +66,7 @@ def measured(*worlds: str) -> Measure:
     return measure
 
 
-def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
-    """Simulation and the emulated hand; of a row that says what the hand draws, a foreign plant as well."""
-    count, seconds = budget.episodes[row.skill], budget.seconds.get(row.skill)
-    task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.skill
-    given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
-    report = {
-        "simulation": simulate(load_policy(policy), (), count, seconds, budget),
-        "hand": trials(task, policy, seed, budget.name, given),
-    }
-    if row.plant:
-        report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
-    return report
-
-
-def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict[str, Any]]:
+def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[str, dict[str, Any]]:
     """The policy of a seed and what its training took; resumes a run that was interrupted."""
     run = RunFolder(folder)
     if not run.report.exists():
@@ -89,9 +88,8 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
                 video=False,
             )
     report = json.loads(run.report.read_text())
-    origin = report["origin"]
-    return folder / report["policy"], {
-        "env_steps": origin["env_steps"],
+    return str(folder / report["policy"]), {
+        "env_steps": report["origin"]["env_steps"],
         **budget.training[row.skill] | budget.learner.get(row.skill, {}),
         "seed": seed,
         "hardware": report["hardware"],
@@ -110,16 +108,19 @@ def task_config(row: Row) -> Any:
 
 def swept(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """A shipped policy at each point of a sweep; a row without a parameter is the reference."""
-    del work
+    del seed, work
     policy, sweep, results = load_policy(row.policy), budget.sweep, []
+    budget = dataclasses.replace(budget, episodes=sweep["episodes"], seconds=sweep["seconds"])
     points: tuple[float | None, ...] = row.points if sweep["points"] else ()
     if len(points) > sweep["points"]:
         points = (points[0], points[-1])
     for point in points or (None,):
-        settings = sweep_settings(row, point)
-        count, seconds = sweep["episodes"][row.skill], sweep["seconds"][row.skill]
-        task = simulate(policy, settings, count, seconds, budget, seed)
-        results.append({"point": point} | _success(row.skill, task))
+        report = simulate(policy, sweep_settings(row, point), budget)
+        names = ("held", "r_taxels", "r_resultant", "force_error_n")
+        if row.skill == "rotate":
+            names = ("kept_to_the_end", "successes_per_minute", "seconds_to_fall", "successes")
+            report["successes"] = report["successes"]["mean"]
+        results.append({"point": point} | {name: report[name] for name in names})
     return {"points": results}
 
 
@@ -128,41 +129,28 @@ def sweep_settings(row: Row, point: float | None) -> list[str]:
     return [] if point is None else [setting.format(point, point) for setting in row.settings]
 
 
-def _success(skill: str, report: dict[str, Any]) -> dict[str, Any]:
-    if skill == "grasp":
-        return {name: report[name] for name in ("held", "r_taxels", "r_resultant", "force_error_n")}
-    return {name: report[name] for name in ("kept_to_the_end", "successes_per_minute", "seconds_to_fall")} | {
-        "successes": report["successes"]["mean"]
-    }
+def simulate(policy: Policy, settings: Sequence[str], budget: Budget) -> dict[str, Any]:
+    """The report of a policy's evaluation in the environment that it was trained in, with changes to its configuration.
 
-
-def simulate(
-    policy: Policy, settings: Any, episodes: int, seconds: float | None, budget: Budget, seed: int = 0
-) -> dict[str, Any]:
-    """The task's report of an evaluation, with the share held of all episodes.
-
-    Args:
-      policy: measured in the environment that it was trained in.
-      settings: changes to that environment's configuration.
-      episodes: at least; rounded up to whole batches of 64 (1,024 on a GPU).
-      seconds: length of an episode; None is the task's own.
-      budget: its backend.
-      seed: of the episodes.
+    Episodes are rounded up to whole batches of 64 (1,024 on a GPU).
     """
-    length = [f"evaluation_seconds={seconds}"] if seconds else []
+    skill, length = skill_of(policy.task), list[str]()
+    if skill in budget.seconds:
+        length = [f"evaluation_seconds={budget.seconds[skill]}"]
     config = json.dumps(override(policy.env_config, [*settings, *length]), sort_keys=True)
-    evaluator = _evaluator(policy.task, config, budget.backend, min(episodes, 1024 if budget.backend == "auto" else 64))
-    report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
-    return {name: value for name, value in report["task"].items() if name != "headline"} | {
-        "backend": evaluator.env.backend
-    }
+    episodes, batch = budget.episodes[skill], 1024 if budget.backend == "auto" else 64
+    return _report(_evaluator(policy.task, config, budget.backend, min(episodes, batch)), policy, episodes)
+
+
+def _report(evaluator: Evaluator, policy: Policy, episodes: int) -> dict[str, Any]:
+    report, _ = evaluator(policy.params, episodes=episodes, seed=0)
+    del report["task"]["headline"]
+    return report["task"] | {"backend": evaluator.env.backend}
 
 
 @functools.lru_cache(maxsize=4)
 def _evaluator(task: str, config: str, backend: str, chunk: int) -> Evaluator:
     """Compiled evaluations; rows of one environment share them."""
-    import dexsim
-
     made = from_dict(find_task(task).config_class, json.loads(config))
     return Evaluator(dexsim.make(task, made, backend=backend), chunk)
 
@@ -173,8 +161,6 @@ def trials(
 ) -> dict[str, Any]:
     """The metrics of trials on the emulated hand in virtual time, every parameter outside training's ranges but those
     that are `given`."""
-    import zero_shot
-
     budget, skill = BUDGETS[budget_name], skill_of(task)
     options = {
         "task": task,
@@ -195,12 +181,7 @@ def trials(
 
 def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """A shipped policy with held-out objects, each at every command."""
-    del work
-    import dexsim
-    from dexsim.env.env import Env
-    from dexsim.tasks.grasp.config import GraspConfig
-    from paper.held_out import NAMES, HeldOutGrasp
-
+    del seed, work
     policy, hand = load_policy(row.policy), dexsim.load_hand()
     names, settings = NAMES, [*row.settings, f"pool_size={HELD_OUT_POOL}"]
     if not budget.training:  # A look at the machinery.
@@ -208,11 +189,8 @@ def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     if seconds := budget.seconds.get("grasp"):
         settings.append(f"evaluation_seconds={seconds}")
     config = from_dict(GraspConfig, override(policy.env_config, settings))
-    chunk = 5 * len(names)
     env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend)
-    report, _ = Evaluator(env, chunk)(policy.params, episodes=budget.objects * len(names), seed=seed)
-    task = {name: value for name, value in report["task"].items() if name != "headline"}
-    return {"simulation": task | {"backend": env.backend}}
+    return {"simulation": _report(Evaluator(env, 5 * len(names)), policy, budget.objects * len(names))}
 
 
 def points_at_twice(low: float, high: float, floor: float = 0.0) -> tuple[float, float, float, float]:

@@ -125,8 +125,8 @@ def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
             results = [seed[world] for seed in seeds(report)]
             line += [
                 percent(s["held"] for s in results),
-                _range(results, ("total_force", "total_force_n")),
-                _range(results, ("total_torque",)),
+                _range(results, "total_force_n"),
+                _range(results, "total_torque"),
                 cell(s["r_resultant"] for s in results),
                 cell(s.get("r_torque") for s in results),
                 cell(s.get("slope_force_n") for s in results),
@@ -135,23 +135,14 @@ def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
     return lines
 
 
-def _range(results: list[dict[str, Any]], names: tuple[str, ...]) -> str:
-    """Means at the first and the last command, averaged over seeds."""
-    ends = []
-    for report in results:
-        means = [value(row, *names) for row in report["by_command"]]
-        if means[0] is not None and means[-1] is not None:
-            ends.append((means[0], means[-1]))
+def _range(results: list[dict[str, Any]], name: str) -> str:
+    """Means at the first and the last command, averaged over the seeds that have both."""
+    ends = [[report["by_command"][k][name]["mean"] for k in (0, -1)] for report in results]
+    ends = [end for end in ends if None not in end]
     if not ends:
         return ""
     low, high = (sum(end[k] for end in ends) / len(ends) for k in (0, 1))
     return f"{low:.3g}–{high:.3g}"
-
-
-def value(row: dict[str, Any], *names: str) -> float | None:
-    """Mean of the first of these names that a command's row has; both worlds name some forces differently."""
-    entry = next((row[name] for name in names if name in row), None)
-    return entry and entry["mean"]
 
 
 def commands(experiment: Experiment, reports: Reports) -> list[list[str]]:
@@ -159,17 +150,13 @@ def commands(experiment: Experiment, reports: Reports) -> list[list[str]]:
     lines = [["world", "command", "held [%]", "finger force [N]", "total force [N]", "total torque"]]
     for world, label in (("simulation", "simulation"), ("hand", "emulated hand")):
         for seed in (s for report in reports.values() for s in seeds(report)):
-            for row in seed[world]["by_command"]:
-                force = row.get("finger_force_n", row.get("finger_force"))
-                total = row.get("total_force_n", row.get("total_force"))
-                cells = percent([row["held"]]), cell([force]), cell([total]), cell([row["total_torque"]])
-                lines.append([label, f"{row['command']:g}", *cells])
-            more = seed[world]
-            r = f"r {cell([more['r_resultant']])}", f"r {cell([more['r_torque']])}"
-            slopes = f"{cell([more['slope_force_n']])} N", cell([more["slope_torque"]])
-            lines.append(
-                [label, "all", percent([more["held"]]), f"{r[0]}, slope {slopes[0]}", "", f"{r[1]}, slope {slopes[1]}"]
-            )
+            result = seed[world]
+            for row in result["by_command"]:
+                cells = [cell([row[name]]) for name in ("finger_force_n", "total_force_n", "total_torque")]
+                lines.append([label, f"{row['command']:g}", percent([row["held"]]), *cells])
+            force = f"r {cell([result['r_resultant']])}, slope {cell([result['slope_force_n']])} N"
+            torque = f"r {cell([result['r_torque']])}, slope {cell([result['slope_torque']])}"
+            lines.append([label, "all", percent([result["held"]]), force, "", torque])
     return lines
 
 

@@ -14,7 +14,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
-from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.twin.virtual import VirtualRun
 from dexsim_real.wire.serial_hand import check_wire
 
 
@@ -34,7 +34,6 @@ class Emulation:
         check_wire(self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
-        self._calibration = ideal_calibration(self.hand)
         self.period, self.task, self._seed, self._trial = self._controller.period, policy.task, seed, -1
 
     def add_controls(self, gui: Any) -> None:
@@ -46,7 +45,7 @@ class Emulation:
     def episode(self) -> Iterator[Frame]:
         self._trial += 1
         plant = EmulatedHand(self.hand, self.task, self._seed, trials=1, first=self._trial)
-        run = VirtualRun(plant, self._controller, self._calibration)
+        run = VirtualRun(plant, self._controller)
         ticks = run.ticking()
         while True:
             run.policy.command = self._command.value if self._command else 0.5
@@ -58,10 +57,8 @@ class Emulation:
         plant, policy, sample = run.plant, run.policy, run.safety.sample
         assert sample is not None, "the policy has ticked"
         joints, position, quat = plant.true_pose()
-        parts = plant.shape.parts
-        goals, measured = policy.goals, sample.measured
-        finger_force = self._controller.spec.finger_force
-        target = np.nan if finger_force is None else np.interp(policy.command, (0, 1), finger_force)
+        parts, goals, measured = plant.shape.parts, policy.goals, sample.measured
+        target = np.interp(policy.command, (0, 1), self._controller.spec.finger_force or (np.nan, np.nan))
         snapshot = Snapshot(
             joint_position=joints,
             object_position=position,
@@ -78,5 +75,5 @@ class Emulation:
             turns=goals.successes if goals else None,
             seconds=run.port.time,
         )
-        command = policy.command if self._command else None
-        return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}", command)
+        kinds, command = tuple(part.kind for part in parts), policy.command if self._command else None
+        return Frame(snapshot, kinds, f"trial {self._trial}", command)

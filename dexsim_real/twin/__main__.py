@@ -174,7 +174,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         folder = arguments.folder or Path(temporary)
         show = functools.partial(print, flush=True)
         twin = Twin(arguments, make_plant(arguments, hand), folder, show)
-        before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: twin.stop())
         calibration = Path(temporary) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
         known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
         save_calibration(calibration, known)
@@ -190,8 +191,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             twin.close()
             if arguments.output:
                 cli.write_json(arguments.output, twin.report())
-            for number, handler in before.items():
-                signal.signal(number, handler)
     return 0
 
 

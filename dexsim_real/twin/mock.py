@@ -7,7 +7,7 @@ go over the palm again and again. Currents and temperatures are those of the emu
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -21,17 +21,13 @@ _SLIP = 0.1  # s that the plant may be behind the clock; what is more is let go,
 
 
 class MockHand(HandDriver):
-    """A driver whose hand is emulated. The plant advances to the `clock` (s) at each call.
+    """A driver whose hand is emulated. The plant advances to the clock's time at each call.
 
     `measures` is what the hand has, names in `driver.WITHOUT`.
     """
 
-    def __init__(
-        self, plant: EmulatedHand, measures: Iterable[str] = WITHOUT, clock: Callable[[], float] = time.monotonic
-    ):
-        self.plant, self.measures, self._clock = plant, frozenset(measures), clock
-        self._time = clock()
-        self.motors = passive_command(plant.hand.num_joints)
+    def __init__(self, plant: EmulatedHand, measures: Iterable[str] = WITHOUT):
+        self.plant, self.measures, self._clock = plant, frozenset(measures), time.monotonic
 
     def connect(self) -> str:
         self._time = self._clock()
@@ -48,21 +44,21 @@ class MockHand(HandDriver):
 
     def read(self) -> DriverState:
         self._advance()
-        now, sensors = self.plant.measure(), dict[str, np.ndarray]()
-        if "currents" in self.measures:
-            sensors["current"] = 1e-3 * now.current
-        if "temperatures" in self.measures:
-            sensors["temperature"] = now.temperature
-        if "taxels" in self.measures:
-            sensors["taxel_force"] = np.maximum(now.taxel_force[..., 2], 0.0)
-        return DriverState(now.joint_position, self.motors["mode"] == Mode.POSITION, **sensors)
+        now, has = self.plant.measure(), self.measures
+        return DriverState(
+            position=now.joint_position,
+            on=self.motors["mode"] == Mode.POSITION,
+            current=1e-3 * now.current if "currents" in has else None,
+            temperature=now.temperature if "temperatures" in has else None,
+            taxel_force=np.maximum(now.taxel_force[..., 2], 0.0) if "taxels" in has else None,
+        )
 
     def close(self) -> None:
         """There is nothing to close."""
 
     def _advance(self) -> None:
         now = self._clock()
-        self.plant.advance(min(max(now - self._time, 0.0), _SLIP))
+        self.plant.advance(min(now - self._time, _SLIP))
         self._time = now
 
     def _drive(self, motors: np.ndarray) -> None:

@@ -27,7 +27,7 @@ from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import BAUD, ImuReader
 from dexsim_real.twin.plant.drives import STALL_CURRENT
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, nominal_gravity
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
 from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
 from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
@@ -152,19 +152,18 @@ class VirtualRun:
 
     plant: EmulatedHand  # a new one, before its first trial
     controller: Controller  # warmed; it is restarted
-    calibration: Calibration  # of this hand
     command: float = 0.5  # grip command in [0, 1]
     limits: SafetyConfig = SafetyConfig()  # of the bridge's safety
 
     def __post_init__(self) -> None:
         plant, controller = self.plant, self.controller
-        trained, mounted = np.asarray(controller.spec.gravity), nominal_gravity(plant.task, plant.hand.thumb_side)
+        trained, mounted = np.asarray(controller.spec.gravity), plant.start.gravity
         if np.abs(trained - mounted).max() > 0.01:
             raise HandError(f"gravity {np.round(trained, 2)} in training, {np.round(mounted, 2)} here: another mount")
         self._trial = plant.trial
         self.safety = Safety(controller.hand, limits_for(self.limits, controller))
         self.port = port = VirtualPort(plant)
-        sensing = HandSensing(controller.hand, HardwareConfig(), self.calibration)
+        sensing = HandSensing(controller.hand, HardwareConfig(), ideal_calibration(controller.hand))
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
         objects = ObjectSensors(np.asarray(controller.spec.reference, float))
         objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None

@@ -8,6 +8,7 @@ import pytest
 from paths import ROOT
 
 from dexsim.core.errors import DexsimError
+from dexsim_real.twin.plant.parameters import start_of
 from dexsim_real.twin.plant.referee import Referee
 
 
@@ -23,11 +24,6 @@ def zero_shot(monkeypatch):
 
     monkeypatch.setattr(module, "run_trial", never)
     return module
-
-
-@pytest.fixture
-def tables(zero_shot):
-    return importlib.import_module("zero_shot_metrics")
 
 
 @pytest.mark.parametrize(
@@ -59,19 +55,19 @@ def test_json_has_options_metrics_and_trials(zero_shot, tmp_path, monkeypatch, c
 # --- metrics and tables --------------------------------------------------------------------------------
 
 
-def test_metrics_of_rotations(tables):
+def test_metrics_of_rotations(zero_shot):
     keys = ("successes", "paper_successes", "seconds_to_fall", "fell", "joint_speed")
     rows = ((0, 1, 3.0, True, 0.5), (10, 11, 60.0, True, 0.5), (50, 51, 120.0, False, 0.5))
-    metrics = tables.rotate_metrics([dict(zip(keys, row, strict=True)) for row in rows])
+    metrics = zero_shot.rotate_metrics([dict(zip(keys, row, strict=True)) for row in rows])
     assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
     assert metrics["seconds_to_fall"]["mean"] == 61.0
     assert metrics["successes_per_minute"]["mean"] == pytest.approx(60 / (183 / 60))  # stuck or not
     assert metrics["kept_to_the_end"]["mean"] == pytest.approx(1 / 3)
-    text = tables.table(metrics, tables.simulated("rotate", "rotate"), {"successes": {"mean": 0.25}})
+    text = zero_shot.table(metrics, zero_shot.simulated("rotate", "rotate"), {"successes": {"mean": 0.25}})
     assert len(text.splitlines()) == 7 and text.splitlines()[1].endswith("0.25")
 
 
-def test_metrics_of_grasps_count_only_what_was_held(tables):
+def test_metrics_of_grasps_count_only_what_was_held(zero_shot):
     def report(c, shape, held):
         forces = {"force": 2 + 5 * c, "normal": (1 + c) ** 2, "taxels": 1 - c}
         report = {f"finger_{name}": value for name, value in forces.items()}
@@ -80,7 +76,7 @@ def test_metrics_of_grasps_count_only_what_was_held(tables):
         return report | time | {"held": held, "command": c, "shape": shape}
 
     reports = [report(c, shape, held) for c in (0.0, 0.5, 1.0) for shape, held in (("box", True), ("sphere", c < 1))]
-    metrics = tables.grasp_metrics(reports, (2.0, 7.0))
+    metrics = zero_shot.grasp_metrics(reports, (2.0, 7.0))
     assert metrics["held"]["mean"] == pytest.approx(5 / 6)
     assert metrics["r_resultant"]["r"] == pytest.approx(1.0) and metrics["r_taxels"]["r"] == pytest.approx(-1.0)
     command = np.array([0.0, 0.0, 0.5, 0.5, 1.0])
@@ -89,7 +85,7 @@ def test_metrics_of_grasps_count_only_what_was_held(tables):
     assert [row["torque_limited"]["mean"] for row in metrics["by_command"]] == [0.0, 0.0, 0.6]
     # The lost object was pressed as wanted, 7 N, for half of the window.
     assert metrics["force_error_n"]["mean"] == pytest.approx(3.5 / np.sqrt(6))
-    assert tables.table(metrics, tables.simulated("grasp", "grasp"), {}).count("(saturates)") == 1
+    assert zero_shot.table(metrics, zero_shot.simulated("grasp", "grasp"), {}).count("command 1 (saturates)") == 3
 
 
 def test_measured_torque_is_of_touching_fingers_in_the_window(zero_shot):
@@ -99,10 +95,10 @@ def test_measured_torque_is_of_touching_fingers_in_the_window(zero_shot):
     assert zero_shot._measured_torque(trace[:2], [3.0, 8.0]) == 0.0
 
 
-def test_both_worlds_name_forces_alike():
+def test_both_worlds_name_forces_alike(hand):
     """What the referee reports is what the task's report reduces, name by name."""
     from dexsim.tasks.grasp.report import FORCES, window
 
-    judge = Referee("grasp", np.zeros(3), np.eye(3)[0])
+    judge = Referee("grasp", start_of(hand, "grasp"))
     assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
     assert judge.window == window(judge.limit) == (3.0, 8.0)

@@ -28,10 +28,10 @@ def world(hand, task="rotate", **overrides):
     return EmulatedHand(hand, task, 0, kind="nominal", overrides=QUIET | IDEAL | {"push_rate": 0.0} | overrides)
 
 
-def free(plant, position, quat=(1.0, 0.0, 0.0, 0.0), *, judged=False):
+def free(plant, position, *, judged=False):
     """Let go of the object anywhere; unless judged, no referee calls that a drop."""
     plant.stage = Stage.FREE
     if not judged:
         plant._look = lambda: None
-    put(plant._scene, plant._data, np.asarray(position, float), np.asarray(quat, float))
+    put(plant._scene, plant._data, np.asarray(position, float), np.array((1.0, 0.0, 0.0, 0.0)))
     mujoco.mj_forward(plant._scene.model, plant._data)

@@ -4,11 +4,12 @@ import os
 import select
 import tempfile
 import threading
-import tty
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
+from dexsim_real.twin.wire.firmware import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HOST_REQUESTS, Command, Frame, Parser
 from dexsim_real.wire.link import LinkConfig
@@ -34,9 +35,7 @@ class PtyHand:
         self.state["joint"]["temperature"] = 30
         self.commands: list[np.ndarray] = []
         self.delay = 0.0  # s, of the next answer on a line in memory
-        self.master = self.slave = -1
-        self.port = ""
-        self._folder = tempfile.TemporaryDirectory()
+        self.port, self._folder = "", tempfile.TemporaryDirectory()
 
     def __enter__(self):
         self.open()
@@ -47,38 +46,27 @@ class PtyHand:
         self._folder.cleanup()
 
     def open(self):
-        """Make the terminal, and a link to it that `close` removes.
-
-        The terminal's own name is no good: the system gives it to the next program that opens one, and a bridge that
-        looks for its lost hand would find a stranger's.
-        """
-        self.master, self.slave = os.openpty()
-        tty.setraw(self.slave)
-        self.port = os.path.join(self._folder.name, "hand")
-        os.symlink(os.ttyname(self.slave), self.port)
-        self._stop = threading.Event()
+        """Make the terminal; its name is gone with it, or a bridge that looks for its lost hand would find the next
+        program's that opens one."""
+        self.terminal, self._stop = Terminal(Path(self._folder.name, "hand")), threading.Event()
+        self.port = str(self.terminal.name)
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
     def close(self):
-        if self.master >= 0:
-            self._stop.set()
-            self._thread.join()
-            os.unlink(self.port)
-            os.close(self.master)
-            os.close(self.slave)
-            self.master = self.slave = -1
+        self._stop.set()
+        self._thread.join()
+        self.terminal.close()
 
     def _serve(self):
         parser = Parser(HOST_REQUESTS)
         while not self._stop.is_set():
-            if not select.select([self.master], [], [], 0.01)[0]:
-                continue
-            for frame in parser.feed(os.read(self.master, 4096)):
+            select.select([self.terminal], [], [], 0.01)
+            for frame in parser.feed(self.terminal.read()):
                 reply = self.reply(frame)
                 while reply and not self._stop.is_set():  # The kernel's buffer holds 4 KiB.
-                    if select.select([], [self.master], [], 0.01)[1]:
-                        reply = reply[os.write(self.master, reply[:1024]) :]
+                    if select.select([], [self.terminal], [], 0.01)[1]:
+                        reply = reply[os.write(self.terminal.fileno(), reply[:1024]) :]
 
     def reply(self, frame: Frame) -> bytes:
         """The answer to a request; empty for silence."""

@@ -41,21 +41,14 @@ class Cable:
         self.to_host += data
         return len(data)
 
-    # Time: it passes only where the host waits.
-
-    def wait(self, seconds, enough=lambda: False):
-        until = self.now + seconds
-        while self.now < until and not enough():
-            self.now = min(max(self.line.due(), self.now + 1e-6), until)
-            self.line.serve(self.now)
-
     def ask(self, data, seconds=0.03):
-        """The pieces that come after sending these bytes, with their times."""
+        """The pieces that come after sending these bytes, with their times; time passes only here."""
         self.to_hand += data
         self.line.serve(self.now)
         until, pieces = self.now + seconds, []
         while self.now < until:
-            self.wait(until - self.now, lambda: self.to_host)
+            self.now = min(max(self.line.due(), self.now + 1e-6), until)
+            self.line.serve(self.now)
             if self.to_host:
                 pieces.append((self.now, bytes(self.to_host)))
                 self.to_host.clear()
@@ -65,9 +58,8 @@ class Cable:
 class Running:
     """A twin that runs in a thread."""
 
-    def __init__(self, folder, plant=None, **options):
-        self.plant = plant or ScriptedPlant()
-        self.twin = Twin(TwinArguments(**options), self.plant, folder, lambda text: None)
+    def __init__(self, folder, **options):
+        self.twin = Twin(TwinArguments(**options), ScriptedPlant(), folder, lambda text: None)
         self.port = str(self.twin.line.terminal.name)
         self._thread = threading.Thread(target=self.twin.run, daemon=True)
         self._thread.start()

@@ -13,26 +13,21 @@ REST = np.array([0.3] * 3 + [0.0] + [0.3] * 8)
 
 
 class ScriptedPlant:
-    """First-order joints, fingertips that press as they bend, an object that turns about the palm's normal.
-
-    Args:
-      trial_seconds: length of a trial.
-      turn: rad/s of the object.
-    """
+    """First-order joints, fingertips that press as they bend, an object at rest; trials of `trial_seconds`."""
 
     hand = SimpleNamespace(side="right")
     up = np.array([math.cos(0.2), 0.0, math.sin(0.2)])
     shape = ObjectShape("box", (Primitive("box", (0.025, 0.025, 0.025)),))
 
-    def __init__(self, trial_seconds=math.inf, turn=0.5):
-        self.trial_seconds, self.turn = trial_seconds, turn
+    def __init__(self, trial_seconds=math.inf):
+        self.trial_seconds = trial_seconds
         self.time, self.angle = 0.0, REST.copy()
         self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
         self.motors = None
 
     @property
     def trial(self):
-        return int(self.time / self.trial_seconds) if math.isfinite(self.trial_seconds) else 0
+        return int(self.time / self.trial_seconds)
 
     def drive(self, motors):
         self.motors = motors
@@ -59,8 +54,7 @@ class ScriptedPlant:
         )
 
     def measure_object(self):
-        half = 0.5 * self.turn * self.time
-        return np.array([0.047, 0.0, 0.071]), np.array([math.cos(half), math.sin(half), 0.0, 0.0]), 9.81 * self.up
+        return np.array([0.047, 0.0, 0.071]), np.array([1.0, 0.0, 0.0, 0.0]), 9.81 * self.up
 
     def results(self):
         return [{"trial": k} for k in range(self.trial + 1)]

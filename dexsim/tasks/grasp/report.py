@@ -10,8 +10,7 @@ SETTLE = 3.0  # s after release from which forces count
 FORCES = {"r_resultant": "force", "r_normal": "normal", "r_taxels": "taxels"}
 """Correlations with the command, and what of the contact force each takes: all of it with friction, what of it presses
 into the skin, and what of that the taxels bear. The metric is `finger_` and this."""
-_COMMANDED = tuple(f"finger_{part}" for part in FORCES.values())
-_MEANS = ("total_force", "total_torque", "touching", "torque_limited")
+MEANS = (*(f"finger_{part}" for part in FORCES.values()), "total_force", "total_torque", "touching", "torque_limited")
 _UNITS = {"total_torque": "total_torque", "touching": "touching_fingers", "torque_limited": "torque_limited"}
 """Names of what is not in N, by metric."""
 
@@ -47,12 +46,34 @@ def summarize(
       pressed. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
-    held, command, shape = alive[-1], metrics["command"][0], metrics["shape"][0].astype(int)
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
-    target = target_force(command, span)
     # Of each episode [N], the mean over its late ticks.
-    late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*_COMMANDED, *_MEANS)}
-    commanded = {part: late_means[f"finger_{part}"] for part in FORCES.values()}
+    late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in MEANS}
+    report = {
+        "episodes": episodes,
+        "seconds": ticks * control_period,
+        "window_s": list(window(ticks * control_period)),
+        **reduce(metrics["command"][0], alive[-1], metrics["shape"][0].astype(int), late_means, span, shapes),
+        "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
+        "non_finite": int(metrics["non_finite"].sum()),
+    }
+    return report | {"headline": _headline(report)}
+
+
+def reduce(
+    command: np.ndarray,
+    held: np.ndarray,
+    shape: np.ndarray,
+    means: dict[str, np.ndarray],
+    span: tuple[float, float],
+    shapes: tuple[str, ...],
+) -> dict:
+    """What the reports of simulation and of the emulated hand share; see `summarize`. Of each episode [N] the command,
+    whether it held to the end, the index of its shape, and by metric its mean over the window, 0 after a loss."""
+    target, force = target_force(command, span), means["finger_force"]
+
+    def correlations(chosen: np.ndarray) -> dict:
+        return {name: pearson(command[chosen], means[f"finger_{part}"][chosen]) for name, part in FORCES.items()}
 
     def command_row(level: float) -> dict:
         mine = command == level
@@ -62,8 +83,9 @@ def summarize(
             "episodes": int(mine.sum()),
             "held": proportion(held[mine]),
             "target_force_n": float(target[mine].mean()),
-            **{_UNITS.get(name, f"{name}_n"): mean(values[good]) for name, values in late_means.items()},
-            "saturates": saturates(late_means["torque_limited"][good]),
+            **{_UNITS.get(name, f"{name}_n"): mean(values[good]) for name, values in means.items()},
+            # Beyond the motors: held objects see a joint at its torque limit most of the time.
+            "saturates": bool(good.any() and means["torque_limited"][good].mean() > 0.5),
         }
 
     def shape_row(index: int) -> dict:
@@ -72,27 +94,21 @@ def summarize(
             "shape": shapes[index],
             "episodes": int(mine.sum()),
             "held": proportion(held[mine]),
-            **correlations(command, mine & held, commanded),
-            "force_error_n": force_error(commanded["force"][mine], target[mine]),
+            **correlations(mine & held),
+            "force_error_n": force_error(force[mine], target[mine]),
         }
 
-    report = {
-        "episodes": episodes,
-        "seconds": ticks * control_period,
-        "window_s": list(window(ticks * control_period)),
+    return {
         "held": proportion(held),
-        **correlations(command, held, commanded),
-        "r_torque": pearson(command[held], late_means["total_torque"][held]),
-        "slope_force_n": slope(command[held], commanded["force"][held]),
-        "slope_torque": slope(command[held], late_means["total_torque"][held]),
-        "force_error_n": force_error(commanded["force"], target),
-        "torque_limited": mean(late_means["torque_limited"][held]),
-        "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
-        "non_finite": int(metrics["non_finite"].sum()),
+        **correlations(held),
+        "r_torque": pearson(command[held], means["total_torque"][held]),
+        "slope_force_n": slope(command[held], force[held]),
+        "slope_torque": slope(command[held], means["total_torque"][held]),
+        "force_error_n": force_error(force, target),
+        "torque_limited": mean(means["torque_limited"][held]),
         "by_command": [command_row(level) for level in np.unique(command)],
         "by_shape": [shape_row(index) for index in np.unique(shape)],
     }
-    return report | {"headline": _headline(report)}
 
 
 def _headline(report: dict) -> dict:
@@ -108,16 +124,6 @@ def _headline(report: dict) -> dict:
         "r, force on the taxels, worst shape": min((r for r in by_shape if r is not None), default=None),
         "time at a torque limit": entry(report["torque_limited"]) | {"unit": "%"},
     }
-
-
-def saturates(torque_limited: np.ndarray) -> bool:
-    """Whether a command is beyond the motors: held objects [N] see a joint at its torque limit most of the time."""
-    return bool(torque_limited.size and torque_limited.mean() > 0.5)
-
-
-def correlations(command: np.ndarray, held: np.ndarray, commanded: dict[str, np.ndarray]) -> dict:
-    """Pearson's r of command [N] and each of `FORCES` [N], of what was held [N]."""
-    return {name: pearson(command[held], commanded[part][held]) for name, part in FORCES.items()}
 
 
 def force_error(values: np.ndarray, target: np.ndarray) -> dict:

@@ -27,12 +27,15 @@ from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.hand_model import own_model, read_model
 from dexsim_real.twin.plant.parameters import (
     EXCHANGE_SENSE,
+    GRAVITY,
     OF_THE_FILE,
     PUSHES,
     STRUCTURE,
+    Start,
     TrialParameters,
     sample_trial,
     skill_of,
+    start_of,
 )
 from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
@@ -40,17 +43,6 @@ from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_s
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 from dexsim_real.wire.frames import Mode
 
-ROTATE_PLACE = (0.007, 0.079)
-"""Position along the palm (y, z) m of a right hand where a cube is placed: the centre of the start states in training.
-Few of them are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
-CLEAR_POSTURE = (1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6)  # rad, of the XHand
-CLEAR_REFERENCE, CLEAR_PLACE = (0.072, 0.005, 0.098), (0.066, 0.007, 0.099)
-"""Nominal position, m, of a cube that turns clear of the palm, and where it is placed: the mean of the start states."""
-CLEAR_AXIS = (0.6, 0.0, -0.8)  # about which it turns
-MOUNT, CLEAR_MOUNT = (-0.2, -0.2), (-1.1, 0.0)
-"""Pitch and roll, rad, of the hand that is palm up (rotate_clear: nearly upright, fingers down): wrist and thumb side
-lowered, or raised where negative."""
-GRAVITY = 9.81  # m/s^2
 PALM_FACE = 0.020  # m, x of the emulated hand's palm
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
 _MEMORY = 0.2  # s, longest delay of a sensor
@@ -121,7 +113,7 @@ class EmulatedHand:
         self._command: np.ndarray | None = None
         # The fingers of a hand without commands are slightly bent.
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
-        self._start = start_of(hand, self.task)
+        self.start = start_of(hand, self.task)
         self._done: list[dict[str, Any]] = []
         self.trial = self.first - 1
         self._next_trial()
@@ -219,16 +211,15 @@ class EmulatedHand:
             shape = sample_shape(parameters, rng, self.shape_name)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
-            self._palm_face = palm_face(scene, tuple(self._start.place)) if self._model.foreign else own
-            place = find_place(scene, parameters, shape, rng, self._palm_face, self._start)
+            self._palm_face = palm_face(scene, self.start.place[-2:]) if self._model.foreign else own
+            place = find_place(scene, parameters, shape, rng, self._palm_face, self.start)
             if place is not None:
                 break
         else:
             raise HandError(f"trial {self.trial}: none of {_OBJECTS} objects had room in the hand's start posture")
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
-        start, fingers, side = self._start, self.hand.num_fingers, self.hand.thumb_side
-        self._referee = Referee(self.task, start.reference, start.axis, self.seconds, fingers, side)
+        self._referee = Referee(self.task, self.start, self.seconds, self.hand.num_fingers)
         put(scene, self._data, place.shelf, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -236,7 +227,7 @@ class EmulatedHand:
     def _draw(self, parameters: TrialParameters, shape: ObjectShape) -> Scene:
         """The scene of another object, in which `_enter` begins."""
         self.parameters, self.shape = parameters, shape
-        self._gravity = tilted_gravity(self.task, parameters.gravity_tilt, self.hand.thumb_side)
+        self._gravity = tilted(self.start.gravity, parameters.gravity_tilt)
         return build_scene(self._model, parameters, shape, self._gravity)
 
     def _enter(self, scene: Scene, rng: np.random.Generator) -> None:
@@ -348,7 +339,7 @@ class EmulatedHand:
     def _assist(self) -> None:
         """What the assistant does now. Released is the object some time after the targets have moved, as by a person,
         and without motors not at all."""
-        command, posture = self._command, self._start.posture
+        command, posture = self._command, self.start.posture
         if command is None or np.any(command["mode"] != Mode.POSITION):
             self._take_away()
             return
@@ -392,56 +383,17 @@ class Pushes:
         return self.last
 
 
-# --- start, mount and place of a trial ---------------------------------------------------------------
+# --- mount and place of a trial ----------------------------------------------------------------------
 
 
-class Start(NamedTuple):
-    """Where the trials of a hand begin; palm frame."""
-
-    posture: np.ndarray  # [J] rad
-    reference: np.ndarray  # [3] m, nominal position of the object
-    place: np.ndarray  # [2] m, y and z where it is placed on the palm; [3] m, x as well: between the fingertips
-    axis: np.ndarray = np.array((1.0, 0.0, 0.0))  # about which it turns
-
-
-def start_of(hand: Hand, task: str) -> Start:
-    """The start by the hand's TOML. HandError: there is none in it."""
-    if task == "rotate_clear":
-        if hand.num_joints != len(CLEAR_POSTURE):
-            raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
-        mirror = np.array((1.0, hand.thumb_side, 1.0))
-        return Start(np.array(CLEAR_POSTURE), mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array(CLEAR_AXIS))
-    if skill_of(task) == "grasp":
-        posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
-        place = np.array(reference[1:])
-    else:
-        posture, reference, names = hand.rotate_posture, hand.rotate_reference, "[rotate] with posture and reference"
-        place = np.array(ROTATE_PLACE) * (hand.thumb_side, 1.0)
-    if not (posture and reference):
-        raise HandError(f"{hand.name}: the emulated hand needs a {names} in its TOML")
-    return Start(np.array(posture), np.array(reference), place)
-
-
-def nominal_gravity(task: str, thumb_side: float = 1.0) -> np.ndarray:
-    """Gravity [3] m/s^2 in the palm frame: upside down to grasp, palm up on a leaning mount to rotate.
-
-    `thumb_side` is the hand's (`Hand.thumb_side`), here and below.
-    """
-    if task == "grasp":
-        return GRAVITY * np.array([1.0, 0.0, 0.0])
-    pitch, roll = CLEAR_MOUNT if task == "rotate_clear" else MOUNT
-    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), thumb_side * np.sin(roll), -np.sin(pitch) * np.cos(roll)])
-
-
-def tilted_gravity(task: str, tilt: np.ndarray, thumb_side: float = 1.0) -> np.ndarray:
+def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     """Gravity [3] m/s^2 in the palm frame of a hand tilted by angles [2] rad about two horizontal axes."""
-    down = nominal_gravity(task, thumb_side)
-    way = down / GRAVITY
+    way = gravity / GRAVITY
     side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made horizontal
     side = side / np.linalg.norm(side)
     for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
-        down = matrix(turn(axis, float(angle))) @ down
-    return down
+        gravity = matrix(turn(axis, float(angle))) @ gravity
+    return gravity
 
 
 class Place(NamedTuple):
@@ -473,7 +425,7 @@ def find_place(
                 quat = product(turn(axis, angle), quat)
             shift = 0.01 * rng.uniform(-1, 1, 2)
             gap, speed = parameters.gap, parameters.release_speed
-        if len(start.place) == 3:
+        if start.clear:
             position = lower(scene, data, start.place + (0.0, *shift), quat)
         else:
             down = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])

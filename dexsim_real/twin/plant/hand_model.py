@@ -78,13 +78,7 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
 
 
 def _in_palm_frame(
-    name: str,
-    spec: mujoco.MjSpec,
-    palm: Pose,
-    hand: Hand,
-    joints: Sequence[str],
-    lattices: list[str],
-    foreign: bool = False,
+    name: str, spec: mujoco.MjSpec, palm: Pose, hand: Hand, joints: Sequence[str], lattices: list[str], foreign=False
 ) -> HandModel:
     """The model with its palm as the world's frame, and prefixed names."""
     place, turn = palm

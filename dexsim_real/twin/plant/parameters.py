@@ -12,7 +12,7 @@ may not choose what it is tested by. The other ranges repeat training's; a test 
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -195,3 +195,57 @@ def sample_trial(
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items()}
     return TrialParameters(task, value)
+
+
+# --- where trials begin ------------------------------------------------------------------------------
+
+GRAVITY = 9.81  # m/s^2
+ROTATE_PLACE = (0.007, 0.079)
+"""Position along the palm (y, z) m of a right hand where a cube is placed: the centre of the start states in training.
+Few of them are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
+CLEAR_POSTURE = (1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6)  # rad, of the XHand
+CLEAR_REFERENCE, CLEAR_PLACE = (0.072, 0.005, 0.098), (0.066, 0.007, 0.099)
+"""Nominal position, m, of a cube that turns clear of the palm, and where it is placed: the mean of the start states."""
+
+
+class Start(NamedTuple):
+    """Where the trials of a hand begin, and its mount; palm frame."""
+
+    posture: np.ndarray  # [J] rad
+    reference: np.ndarray  # [3] m, nominal position of the object
+    place: np.ndarray  # [2] m, y and z where it is placed on the palm; [3] m, x as well: between the fingertips
+    gravity: np.ndarray  # [3] m/s^2
+    turn: float = np.pi / 2  # rad from one goal to the next, about the axis
+    axis: np.ndarray = np.array((1.0, 0.0, 0.0))
+
+    @property
+    def clear(self) -> bool:
+        """Whether the fingers hold the object clear of the palm."""
+        return len(self.place) == 3
+
+
+def start_of(hand: Hand, task: str) -> Start:
+    """The start by the hand's TOML; goals, mount and place of a left hand are the mirror image of those of a right
+    one. HandError: there is none in it."""
+    side = hand.thumb_side
+    mirror, quarter = np.array((1.0, side, 1.0)), side * np.pi / 2
+    if task == "rotate_clear":
+        if hand.num_joints != len(CLEAR_POSTURE):
+            raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
+        middle, place, axis = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array((0.6, 0.0, -0.8))
+        return Start(np.array(CLEAR_POSTURE), middle, place, gravity(-1.1, 0.0, side), quarter, axis)
+    if skill_of(task) == "grasp":
+        posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
+        place, down = np.array(reference[1:]), GRAVITY * np.array([1.0, 0.0, 0.0])
+    else:
+        posture, reference, names = hand.rotate_posture, hand.rotate_reference, "[rotate] with posture and reference"
+        place, down = mirror[1:] * ROTATE_PLACE, gravity(-0.2, -0.2, side)
+    if not (posture and reference):
+        raise HandError(f"{hand.name}: the emulated hand needs a {names} in its TOML")
+    return Start(np.array(posture), np.array(reference), place, down, quarter)
+
+
+def gravity(pitch: float, roll: float, side: float) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame of a hand that is palm up but for angles in rad, by which wrist and thumb
+    side are lowered, or raised where negative."""
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), side * np.sin(roll), -np.sin(pitch) * np.cos(roll)])

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dexsim_real.twin.plant.parameters import skill_of
+from dexsim_real.twin.plant.parameters import Start, skill_of
 from dexsim_real.twin.plant.shapes import matrix, product, turn
 
 LIMITS = {"grasp": 8.0, "rotate": 120.0}
 """Time limit in s of a trial, by task."""
 LOST = {"grasp": 0.12, "rotate": 0.07}  # m, drop radius
-GOAL_STEP, GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = math.pi / 2, 0.3, 0.05, 2.0  # rad, rad, m, rad/s
+GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = 0.3, 0.05, 2.0  # rad, m, rad/s
 _FASTEST = {"task": GOAL_SPIN, "paper": math.inf}  # rad/s about the axis at which a goal counts
 TIPPED = 1.0  # rad
 TOUCH = 0.1  # N above which a fingertip counts as touching (for forces of a grasp: `_GRIP`)
@@ -68,24 +68,14 @@ class Look(NamedTuple):
 class Referee:
     """Follows one trial from release to end.
 
-    `reference` [3] m is the nominal position of the object, `axis` [3] that of the rotation, `seconds` the time limit
-    (None: the task's); the goals of a left hand, by its `thumb_side`, are those of its mirror image.
+    `seconds` is the time limit, None that of the task.
     """
 
-    def __init__(
-        self,
-        task: str,
-        reference: np.ndarray,
-        axis: np.ndarray,
-        seconds: float | None = None,
-        fingers: int = 5,
-        thumb_side: float = 1.0,
-    ):
-        self._axis, self._clear, task = np.asarray(axis), task == "rotate_clear", skill_of(task)
-        self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
+    def __init__(self, task: str, start: Start, seconds: float | None = None, fingers: int = 5):
+        self.task = task = skill_of(task)
+        self._start, self._axis, self.limit = start, start.axis, LIMITS[task] if seconds is None else seconds
         self.time, self.end = 0.0, ""  # s; why the trial ended, empty while it lasts
         self.window = min(_SETTLE, self.limit / 2), self.limit  # s after release between which forces count
-        self._reference, self._step = np.asarray(reference), thumb_side * GOAL_STEP
         self._touched = -math.inf
         self._counted, self._limited = 0, 0
         self._force, self._speed = np.zeros(fingers), 0.0
@@ -103,12 +93,12 @@ class Referee:
         self._speed += step * float(np.mean(np.abs(look.joint_speed)))
         if look.touching:
             self._touched = self.time
-        away = float(np.linalg.norm(look.position - self._reference))
+        away = float(np.linalg.norm(look.position - self._start.reference))
         self._gripped |= look.touching >= 2
         self._looks.append((self.time, look))
         while self._looks[0][0] < self.time - _TRAP:
             self._looks.popleft()
-        fallen = self.task == "rotate" and look.tilt(self._axis) > TIPPED or self._clear and look.height < ON_PALM
+        fallen = self.task == "rotate" and look.tilt(self._axis) > TIPPED or self._start.clear and look.height < ON_PALM
         if away > LOST[self.task] or fallen:
             self.end = f"dropped: {self._cause(away)}"
             return
@@ -140,7 +130,7 @@ class Referee:
         if touched and np.mean(touched) > 0.5:
             return "at the torque limit"
         if away <= LOST[self.task]:
-            return "on the palm" if self._clear and last[-1].height < ON_PALM else "tipped"
+            return "on the palm" if self._start.clear and last[-1].height < ON_PALM else "tipped"
         return "pushed out" if self.time - self._touched <= _RECENT else "slipped"
 
     def _count_goals(self, look: Look, away: float) -> None:
@@ -149,7 +139,7 @@ class Referee:
             self._heading = 2 * math.atan2(look.quat[1:] @ self._axis, look.quat[0])
         spin = abs(float(look.velocity @ self._axis))
         for name, fastest in _FASTEST.items():
-            goal = turn(self._axis, self._heading + (self.goals[name] + 1) * self._step)
+            goal = turn(self._axis, self._heading + (self.goals[name] + 1) * self._start.turn)
             apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], look.quat)[0]))))
             self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and spin <= fastest
 

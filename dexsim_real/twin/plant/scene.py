@@ -76,7 +76,7 @@ def build_scene(hand: HandModel, parameters: TrialParameters, shape: ObjectShape
     return scene
 
 
-def palm_face(scene: Scene, place: tuple[float, ...]) -> float:
+def palm_face(scene: Scene, place: np.ndarray) -> float:
     """Height x in m of a foreign palm's surface at a place (y, z) m along it; 0 where there is none."""
     model = scene.model
     data, start = mujoco.MjData(model), np.array([_FAR, *place])

@@ -71,12 +71,9 @@ def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: st
     """Sample the object of a trial: a cube to rotate, or a box or upright cylinder; to grasp, one of `SHAPES`, or
     the named one."""
     which, box_body = rng.choice(SHAPES), rng.random() < 0.5
-    if parameters.task in ("rotate", "rotate_clear"):
-        edge = parameters.edge / 2
-        return ObjectShape("box", (Primitive("box", (edge, edge, edge)),))
-    if parameters.task == "rotate_any":
-        a, b, c = (float(edge) for edge in parameters.edge / 2 * parameters.proportions)
-        if box_body:
+    if "edge" in parameters.value:
+        a, b, c = (parameters.edge / 2 * parameters.value.get("proportions", np.ones(3))).tolist()
+        if box_body or "proportions" not in parameters.value:
             return ObjectShape("box", (Primitive("box", (a, b, c)),))
         return ObjectShape("cylinder", (Primitive("disc", (b, a)),))
     name = name or str(which)

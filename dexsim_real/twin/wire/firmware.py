@@ -127,8 +127,7 @@ class Terminal:
     """
 
     def __init__(self, link: Path):
-        self.name = Path(link)
-        self._master = self._slave = -1
+        self.name, self._master, self._slave = Path(link), -1, -1
         ours = self.name.is_symlink() and os.path.realpath(self.name).startswith("/dev/pts/")
         if self.name.exists() and not ours:
             raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")

@@ -5,7 +5,7 @@ import pytest
 from dexsim.hand.load import load_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.virtual import VirtualRun, ideal_calibration
+from dexsim_real.twin.virtual import VirtualRun
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def trial(hand, controller_of):
         controller.warm()
         task = controller.policy.task
         plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape_name="sphere")
-        report = VirtualRun(plant, controller, ideal_calibration(hand), command).run()
+        report = VirtualRun(plant, controller, command).run()
         assert report["bridge"]["latched"] == "", report
         return report
 

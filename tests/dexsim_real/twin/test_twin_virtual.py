@@ -43,7 +43,7 @@ class Scripted:
 def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
     plant = EmulatedHand(hand, task, 4, kind="nominal", trials=1, seconds=seconds, overrides=CALM | overrides)
     controller = Scripted(hand, task, script, sources)
-    return VirtualRun(plant, controller, ideal_calibration(hand), 0.25), plant, controller
+    return VirtualRun(plant, controller, 0.25), plant, controller
 
 
 def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import threading
 import time
 
@@ -166,7 +165,7 @@ def test_a_line_that_never_falls_silent_does_not_hold_the_driver():
 
         def babble():
             while not stop.wait(0.0005):
-                os.write(peer.master, b"\x55" * 50)
+                peer.terminal.write(b"\x55" * 50)
 
         thread = threading.Thread(target=babble)
         thread.start()

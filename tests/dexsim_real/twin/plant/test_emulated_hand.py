@@ -12,8 +12,8 @@ from emulated_plant import free, motors, world
 from dexsim.randomization import tilted_down
 from dexsim_real.twin.plant import emulated_hand, scene
 from dexsim_real.twin.plant.drives import PERIOD
-from dexsim_real.twin.plant.emulated_hand import GRAVITY, EmulatedHand, Stage, nominal_gravity, put, tilted_gravity
-from dexsim_real.twin.plant.parameters import TASKS
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put, tilted
+from dexsim_real.twin.plant.parameters import GRAVITY, TASKS, start_of
 from dexsim_real.twin.plant.shapes import matrix
 from dexsim_real.wire.frames import Mode
 
@@ -32,17 +32,17 @@ def test_free_fall(hand):
     held = world(hand, "rotate", imu_noise=0.0)
     held.advance(0.05)
     _, quat, felt = held.measure_object()
-    assert matrix(quat) @ felt == pytest.approx(-nominal_gravity("rotate"), abs=1e-6)
+    assert matrix(quat) @ felt == pytest.approx(-held.start.gravity, abs=1e-6)
 
 
 @pytest.mark.parametrize("task", SKILLS)
-def test_the_ends_of_trainings_tilts_are_those_of_a_mount(task):
+def test_the_ends_of_trainings_tilts_are_those_of_a_mount(hand, task):
     """Pitch and roll on both sides, each in its own way; which sign is which says nothing."""
-    down = nominal_gravity(task) / GRAVITY
+    down = start_of(hand, task).gravity
     for pitch, roll in ((0.1, 0.1), (0.1, 0.0), (0.0, 0.1)):
         angles = np.array([(a * pitch, b * roll) for a in (-1, 1) for b in (-1, 1)])
-        trained = np.stack([tilted_down(down, jnp.asarray(both)) for both in angles])
-        mounted = np.stack([tilted_gravity(task, both) for both in angles]) / GRAVITY
+        trained = np.stack([tilted_down(down / GRAVITY, jnp.asarray(both)) for both in angles])
+        mounted = np.stack([tilted(down, both) for both in angles]) / GRAVITY
         assert np.linalg.norm(mounted, axis=-1) == pytest.approx(1.0)
         apart = np.linalg.norm(trained[:, None] - mounted, axis=-1)
         assert np.all(apart.min(0) < 1e-3) and np.all(apart.min(1) < 1e-3)
@@ -67,26 +67,24 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
 
 
+BALL = """<mujoco>
+  <option timestep="{}" gravity="0 0 -{}" cone="elliptic" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <geom name="floor" type="box" size="1 1 .1" pos="0 0 -.1"/>
+    <body pos="0 0 .03"><freejoint/><geom name="ball" size=".03" mass=".1"/></body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="ball" condim="4"/></contact>
+</mujoco>"""
+
+
 @pytest.mark.parametrize("stiffness", [1700.0, 8000.0])
 def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
     def drop(speed, gravity):
-        spec = mujoco.MjSpec()
-        spec.option.timestep, spec.option.gravity = scene.TIMESTEP, [0, 0, -gravity]
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.worldbody.add_geom(
-            name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1], contype=0, conaffinity=0
-        )
-        body = spec.worldbody.add_body(pos=[0, 0, 0.03])
-        body.add_freejoint()
-        body.add_geom(
-            name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.1, contype=0, conaffinity=0
-        )
-        spec.add_pair(geomname1="floor", geomname2="ball", condim=4)
-        model = spec.compile()
-        model.pair_solref[0], model.pair_solimp[0] = scene.spring(
-            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1), scene.TIMESTEP
-        )
+        model = mujoco.MjModel.from_xml_string(BALL.format(scene.TIMESTEP, gravity))
+        damping = scene.damping_of(0.08, stiffness, 0.1)
+        contact = scene.spring(model.body_invweight0[:, 0].sum(), stiffness, damping, scene.TIMESTEP)
+        model.pair_solref[0], model.pair_solimp[0] = contact
         data = mujoco.MjData(model)
         data.qvel[2] = -speed
         mujoco.mj_step(model, data, 4000)

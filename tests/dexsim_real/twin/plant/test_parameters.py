@@ -2,6 +2,8 @@
 
 import ast
 import dataclasses
+import functools
+import operator
 from pathlib import Path
 
 import jax
@@ -11,13 +13,14 @@ import pytest
 from paths import ROOT
 
 import dexsim_real.twin.plant
+from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.start import CLEARANCE
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant import emulated_hand, referee
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear, nominal_gravity, start_of
-from dexsim_real.twin.plant.parameters import BANDS, FAR, NEAR, PUSHES, TASK_BANDS, sample_trial, skill_of
+from dexsim_real.twin.plant import emulated_hand, parameters, referee
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear
+from dexsim_real.twin.plant.parameters import BANDS, FAR, KINDS, NEAR, TASK_BANDS, sample_trial, skill_of, start_of
 
 SKILLS = ("grasp", "rotate", "rotate_clear")  # rotate_any shares all but its objects and its mount with rotate
 
@@ -26,48 +29,23 @@ def bands(task):
     return BANDS | TASK_BANDS[task]
 
 
-def _lookup(config, path):
-    for name in path.split("."):
-        config = config[name]
-    return config
-
-
-def trained_bands(task):
-    """Those that training has; the others are the emulated hand's own."""
-    return {name: band for name, band in bands(task).items() if band.origin and band.sides != "within"}
-
-
-def test_fingertips_and_friction_follow_nothing_of_training():
-    """Their values fill ranges of the emulated hand's own, whatever training has."""
-    for task in SKILLS:
-        own = {name: band for name, band in bands(task).items() if band.sides == "within"}
-        assert own.keys() - {"reaction"} == {"rubber", "friction", "link_friction"}
-        drawn = [sample_trial(task, np.random.default_rng(seed)).value for seed in range(100)]
-        for name, band in own.items():
-            values = np.array([each[name] for each in drawn])
-            assert np.all((values >= band.low) & (values <= band.high)), name
-            assert np.ptp(values) > 0.9 * (band.high - band.low), name
-
-
 @pytest.mark.parametrize("task", SKILLS)
 def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_policies(hand, task):
     from dexsim_ppo.policy import load_policy
 
     shipped = load_policy(task).env_config
     for config in (to_dict(TRAINED[task].config()), shipped):
-        for name, band in trained_bands(task).items():
-            trained = _lookup(config, band.origin)
-            low, high = (
-                trained
-                if isinstance(trained, (tuple, list))
-                else ((-trained, trained) if band.low < 0 else (trained, trained))
-            )
+        for name, band in bands(task).items():
+            if not band.origin or band.sides == "within":  # the emulated hand's own
+                continue
+            trained = functools.reduce(operator.getitem, band.origin.split("."), config)
+            low, high = trained if isinstance(trained, (tuple, list)) else (np.sign(band.low) * trained, trained)
             if (task, name) == ("rotate", "latency") and high > band.high:  # trained on later hands than these
                 continue
             assert (band.low, band.high) == pytest.approx((low, high)), name
         skill = skill_of(task)
-        assert PUSHES[skill][1] == config["push_speed"]
-        assert PUSHES[skill][0] == pytest.approx(
+        assert parameters.PUSHES[skill][1] == config["push_speed"]
+        assert parameters.PUSHES[skill][0] == pytest.approx(
             config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
         )
         assert referee.LOST[skill] == config["drop_distance"]
@@ -76,11 +54,11 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     start = start_of(hand, task)
     assert start.reference == pytest.approx(rules.reference)
     assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
-    assert nominal_gravity(task) == pytest.approx(rules.gravity)
+    assert start.gravity == pytest.approx(rules.gravity)
     if skill == "rotate":
         assert start.axis == pytest.approx(rules.turn.unit_axis) and referee.ON_PALM == CLEARANCE
         turn = rules.config.turn
-        ours = (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
+        ours = (start.turn, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
         assert ours == pytest.approx((turn.step, turn.angle, turn.distance, turn.spin, rules.config.drop_tilt))
 
 
@@ -95,10 +73,10 @@ def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_
 
 def test_a_cube_between_the_fingertips_is_put_where_they_carry_it(hand):
     """A millimetre lower it would overlap with them."""
-    for trial in range(3):
-        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial)
+    for trial, model in enumerate((None, None, asset_path("plants/foreign_right.xml"))):
+        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial, plant_model=model)
         place, scene, data = plant._place, plant._scene, mujoco.MjData(plant._scene.model)
-        scene.set_joints(data, plant._start.posture)
+        scene.set_joints(data, plant.start.posture)
         at, lower = place.position, place.position - 0.001 * plant.up
         assert is_clear(scene, data, at, place.quat) and not is_clear(scene, data, lower, place.quat)
 
@@ -111,28 +89,27 @@ def test_the_fingers_leave_room_where_a_cube_is_put(hand, monkeypatch):
 
 
 @pytest.mark.parametrize("task", SKILLS)
-def test_every_value_lies_outside_its_range_and_near_it(task):
-    sides = {name: set() for name in trained_bands(task)}
-    for seed in range(60):
-        parameters = sample_trial(task, np.random.default_rng(seed))
-        for name, band in trained_bands(task).items():
-            value, width = parameters.value[name], band.high - band.low
-            assert np.all((value < band.low) | (value > band.high)), name
-            assert np.all(value >= band.low - (FAR + 1e-9) * width), name
-            assert np.all(value <= band.high + (FAR + 1e-9) * width), name
-            beyond = np.maximum(band.low - value, value - band.high)
-            assert np.all(beyond >= (NEAR - 1e-9) * width), name
-            sides[name] |= set(np.atleast_1d(value > band.high).ravel().tolist())
-    for name, band in trained_bands(task).items():
-        assert sides[name] == {"both": {True, False}, "high": {True}, "low": {False}}[band.sides], name
+def test_values_are_where_their_kind_says(task):
+    """Outside: beyond every possible end of training's range and near it. Fingertips and friction follow nothing of
+    training: their values fill ranges of the emulated hand's own."""
+    seeds = [np.random.default_rng(seed) for seed in range(100)]
+    drawn = {kind: [sample_trial(task, rng, kind).value for rng in seeds] for kind in KINDS}
+    own = {name for name, band in bands(task).items() if band.sides == "within"}
+    assert own - {"reaction"} == {"rubber", "friction", "link_friction"}
+    for name, band in bands(task).items():
+        outside, inside, nominal = (np.array([value[name] for value in drawn[kind]]) for kind in KINDS)
+        width = band.high - band.low
+        assert np.all((inside >= band.low) & (inside <= band.high)) and np.all(nominal == band.nominal), name
+        beyond = np.maximum(band.low - outside, outside - band.high)
+        if name in own:
+            assert np.all(beyond <= 0) and np.ptp(outside) > 0.9 * width, name
+        else:
+            assert np.all((beyond >= (NEAR - 1e-9) * width) & (beyond <= (FAR + 1e-9) * width)), name
+            ends = {"both": {True, False}, "high": {True}, "low": {False}}[band.sides]
+            assert set((outside > band.high).ravel().tolist()) == ends, name
 
 
-def test_inside_nominal_and_overrides():
-    for task in SKILLS:
-        inside, nominal = (sample_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))
-        for name, band in bands(task).items():
-            assert np.all((inside.value[name] >= band.low) & (inside.value[name] <= band.high)), name
-            assert np.all(nominal.value[name] == band.nominal), name
+def test_a_parameter_can_be_fixed():
     fixed = sample_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
     assert np.all(fixed.gear_play == 0.002) and fixed.rolling == 0.0
     assert np.array_equal(fixed.stiffness, sample_trial("grasp", np.random.default_rng(3)).stiffness)

@@ -8,9 +8,9 @@ from emulated_plant import IDEAL, QUIET, free, motors
 from dexsim.core.assets import asset_path
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand
-from dexsim_real.twin.plant.emulated_hand import GRAVITY, EmulatedHand, Stage
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage
 from dexsim_real.twin.plant.hand_model import read_model
-from dexsim_real.twin.plant.parameters import sample_trial
+from dexsim_real.twin.plant.parameters import GRAVITY, sample_trial
 from dexsim_real.twin.plant.scene import TipContact
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 

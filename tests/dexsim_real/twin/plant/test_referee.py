@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dexsim_real.twin.plant import referee
+from dexsim_real.twin.plant.parameters import Start
 from dexsim_real.twin.plant.referee import Look, Referee
 from dexsim_real.twin.plant.shapes import product, turn
 
@@ -13,21 +14,14 @@ X = np.array((1.0, 0.0, 0.0))
 PLACE = np.array((0.047, 0.024, 0.088))  # nominal, of the object
 
 
+def start(axis=X, clear=False):
+    return Start(np.zeros(12), PLACE, PLACE[0 if clear else 1 :], 9.81 * X, axis=axis)
+
+
 def seen(position, quat=(1.0, 0, 0, 0), spin=X * 0.0, force=0.0, limited=False, disturbed=False, height=0.01):
     force = np.broadcast_to(force, 5).astype(float)
-    joints = np.full(12, 0.3), np.full(12, 0.5)
-    return Look(
-        np.asarray(position, float),
-        np.asarray(quat, float),
-        spin,
-        height,
-        force,
-        0.8 * force,
-        0.5 * force,
-        *joints,
-        limited,
-        disturbed,
-    )
+    forces, joints = (force, 0.8 * force, 0.5 * force), (np.full(12, 0.3), np.full(12, 0.5))
+    return Look(np.array(position, float), np.array(quat, float), spin, height, *forces, *joints, limited, disturbed)
 
 
 def look(judge, quat, spin=X * 0.0, away=0.0, step=0.01):
@@ -36,7 +30,7 @@ def look(judge, quat, spin=X * 0.0, away=0.0, step=0.01):
 
 
 def spinning(rate, seconds, heading=0.05, step=0.01, axis=X):
-    judge = Referee("rotate", PLACE, axis)
+    judge = Referee("rotate", start(axis))
     for k in range(round(seconds / step) + 1):
         look(judge, turn(axis, heading + rate * k * step), rate * axis)
     return judge.goals["task"], judge.goals["paper"]
@@ -53,7 +47,7 @@ def test_goals_of_a_steady_turn():
 
 
 def test_a_goal_needs_the_whole_orientation_and_the_place():
-    judge, quarter = Referee("rotate", PLACE, X), turn((1, 0, 0), math.pi / 2)
+    judge, quarter = Referee("rotate", start()), turn((1, 0, 0), math.pi / 2)
     look(judge, turn((1, 0, 0), 0.0))
     look(judge, quarter, away=0.06)
     look(judge, product(turn((0, 0, 1), 0.35), quarter))
@@ -64,7 +58,7 @@ def test_a_goal_needs_the_whole_orientation_and_the_place():
 
 def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0), limited=0.0, push=()):
     """A trial with a look each 10 ms; `limited`: share of looks with a joint at its limit, `push`: when one acts."""
-    judge = Referee(task, PLACE, X, seconds)
+    judge = Referee(task, start(), seconds)
     for k, position in enumerate(positions):
         force, now = (part(k) if callable(part) else part for part in (tips, quat))
         judge.watch(0.01, seen(position, now, X * 0.0, force, k % 10 < 10 * limited, k in push))
@@ -94,15 +88,15 @@ def test_drops_and_their_causes():
 
 
 def test_a_cube_held_clear_of_the_palm_is_lost_on_it():
-    for task, end in (("rotate", ""), ("rotate_clear", "dropped: on the palm")):
-        judge = Referee(task, PLACE, X)
+    for clear, end in ((False, ""), (True, "dropped: on the palm")):
+        judge = Referee("rotate", start(clear=clear))
         for height in (0.01, 0.0005):
             judge.watch(0.01, seen(PLACE, force=1.0, height=height))
         assert judge.end == end
 
 
 def test_forces_of_a_grasp_are_means_from_three_seconds_on():
-    judge = Referee("grasp", PLACE, X)
+    judge = Referee("grasp", start())
     for k in range(801):
         force = np.array((9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else [50.0] * 5)
         judge.watch(0.01, seen(PLACE, force=force, limited=k % 4 == 0))

@@ -22,22 +22,15 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 def test_distances_agree_with_mujoco(part):
     spec = mujoco.MjSpec()
     scene.add_object(spec, ObjectShape("x", (part,)))
-    for k in range(200):
-        spec.worldbody.add_geom(
-            name=f"p{k}",
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[1e-5, 0, 0],
-            pos=np.random.default_rng(k).uniform(-0.06, 0.06, 3),
-        )
+    points = np.random.default_rng(1).uniform(-0.06, 0.06, (200, 3))
+    for point in points:  # the geoms before the object's
+        spec.worldbody.add_geom(size=[1e-5, 0, 0], pos=point)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:3] = 0.0
     mujoco.mj_kinematics(model, data)
-    part_id = model.geom("object_0").id
-    ids = [model.geom(f"p{k}").id for k in range(200)]
-    points = data.geom_xpos[ids]
     ours = ObjectShape("x", (part,)).distance(points)
-    theirs = np.array([mujoco.mj_geomDistance(model, data, part_id, k, 1.0, np.zeros(6)) + 1e-5 for k in ids])
+    theirs = np.array([mujoco.mj_geomDistance(model, data, 200, k, 1.0, np.zeros(6)) + 1e-5 for k in range(200)])
     outside = theirs > 1e-3
     assert ours[outside] == pytest.approx(theirs[outside], abs=1e-5)
     assert np.all((ours < 0) == (theirs < 0))
