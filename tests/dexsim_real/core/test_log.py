@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-import zlib
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from paths import ROOT
 
-from dexsim_real.core.log import _HEAD, MAGIC, SYNC, Kind, LogError, LogReader, LogWriter, encode
+from dexsim_real.core.log import MAGIC, Kind, LogError, LogReader, LogWriter, encode
 
 
 def test_what_goes_in_comes_out_in_order(tmp_path):
@@ -64,19 +63,6 @@ def test_damage_costs_the_damaged_record_only(small, tmp_path_factory, data):
     reader = LogReader(path)
     got = {record.content for record in reader}
     assert got <= {f"note {i}" for i in range(20)} and len(got) == 19 and reader.damaged > 0
-
-
-def test_a_forged_log_costs_time_in_proportion_to_its_size(tmp_path, monkeypatch):
-    """Heads everywhere, each of which claims megabytes: checksums over all of them would be quadratic."""
-    summed, crc32 = [], zlib.crc32
-    path = tmp_path / "run.log"
-    path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + _HEAD.pack(SYNC, 4_000_000, 0) * 400_000)
-    monkeypatch.setattr(zlib, "crc32", lambda data: summed.append(len(data)) or crc32(data))
-    records = iter(LogReader(path))
-    assert next(records).content == "before"
-    with pytest.raises(LogError, match="nearly all of it is damaged"):
-        next(records)
-    assert 4_000_000 < sum(summed) < 6 * path.stat().st_size
 
 
 def test_files_that_are_no_log(tmp_path):
