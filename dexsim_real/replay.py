@@ -28,22 +28,19 @@ from dexsim.observation import Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.controller import make_observe, prepare_jax
-from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
 _KEPT = 50  # newest frames, of which a tick used one
-_OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
-"""Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
 class Replay:
     """A log that is recomputed record by record; `meta` is the configuration of the run."""
 
     def __init__(self, path: Path, meta: dict[str, Any], hand: str):
-        if options := _OTHERS.get(str(meta.get("task"))):
-            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate {options} {path}` reads it")
+        if "spec" not in meta:
+            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate --from-log` reads it")
         self.hand = recorded_hand(meta.get("hand"), hand, "the log") or load_hand()
         calibration = None
         if meta["calibration"]:
@@ -160,10 +157,6 @@ class ReplayArguments:
     """The TOML of a hand of your own, where it is not in the place that the log names."""
     output: Path | None = None
     """JSON file for the report; None writes no file."""
-
-    def __post_init__(self):
-        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
