@@ -41,8 +41,7 @@ class SerialHand(ReconnectingPort):
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
-        self._others = self._early = 0  # frames of other hands; answers that came sooner than the baud rate allows
-        self._owed = False  # whether the last request has not been answered yet
+        self._others = 0  # frames of other hands
 
     def connect(self) -> str:
         """Open the port and identify the hand; see `HandPort.connect`."""
@@ -135,9 +134,7 @@ class SerialHand(ReconnectingPort):
                     answer = frame
                 else:  # It answers an earlier request.
                     self.counts.late += 1
-                    self._early += not (possible or self._owed)
                     self._received -= size
-        self._owed = answer is None and not self._early
         return answer
 
     def _read(self) -> bytes:
@@ -208,10 +205,9 @@ class SerialHand(ReconnectingPort):
         config, counts = self.config, self.counts
         if not self._received and not counts.late:
             why = f"no answer; check the power, the A and B wires of RS485, and --link.hand-id (now {config.hand_id})"
-        elif self._early:
-            why = f"answers arrive sooner than {config.baud} baud allow; use --link.no-paced for an emulated line"
         elif counts.late:
             why = f"answers come too late; raise --link.margin (now {config.margin:g} s), or check the latency timer"
+            why += "; an emulated line without the timing of the wire needs --link.no-paced"
         elif self._others:
             why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
         elif self.refusal is not None:

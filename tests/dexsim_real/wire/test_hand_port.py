@@ -35,14 +35,13 @@ def test_why_a_hand_does_not_answer(answer, says):
         SerialHand(peer.port, QUICK).connect()
 
 
-def test_answers_that_come_too_soon_or_too_late_are_told_apart(monkeypatch):
+def test_answers_that_come_too_soon_or_too_late_are_told(monkeypatch):
     """Of an emulated line without pace; or each so late that it meets the next request."""
-    soon, late = "sooner than 3000000 baud.*--link.no-paced", "too late; raise --link.margin"
-    for version, delay, says in ((b"1", 0.0, soon), (None, 0.113, late), (None, 0.15, late)):
+    for version, delay in ((b"1", 0.0), (None, 0.113), (None, 0.15)):
         peer = PtyHand(version=version)
         peer.delay = delay
         memory_line.connect(monkeypatch, peer, memory_line.Clock())
-        with pytest.raises(HandError, match=says):
+        with pytest.raises(HandError, match="too late; raise --link.margin.*--link.no-paced"):
             SerialHand("loop://", dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)).connect()
 
 
