@@ -25,13 +25,13 @@ from dexsim.core.config import setting, to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, Tick, prepare_jax
+from dexsim_real.control.guard import Guard
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
 from dexsim_real.loop import LoopOptions, LoopThread, Pace, keep_phase
-from dexsim_real.run.guard import Guard
 from dexsim_real.run.status import HandState, StatusView
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
@@ -227,7 +227,7 @@ class Session:
         guarded = arguments.guard and not arguments.motors_off
         policy = load_policy(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
-        self.guard = Guard(arguments.port, arguments.link, hand) if guarded else None
+        guard = Guard(arguments.port, arguments.link, hand) if guarded else None
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.port = open_port(arguments.port, hand, arguments.link, self._tap)
         self.controller = Controller(policy, calibrated_hand(hand, calibration))
@@ -240,8 +240,7 @@ class Session:
         realtime = arguments.realtime and use_realtime()
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log"))
         rate = keep_phase(arguments.rate, policy.control_rate)
-        beat = self.guard.beat if self.guard else lambda more: None
-        self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
+        self.loop = LoopThread(self.port, self.sensing, self.safety, rate, guard)
         self.loop.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
         self.policy: PolicyLoop | None = None  # from `prepare` on
@@ -290,8 +289,6 @@ class Session:
         gc.collect()
         gc.freeze()
         with self.view:
-            if self.guard:
-                self.guard.arm()
             if not self.arguments.motors_off:
                 self.loop.engage()
                 self._await_motors()
@@ -311,8 +308,6 @@ class Session:
             return
         self.end = reason or self.end
         self.loop.stop()
-        if self.guard:
-            self.guard.dismiss(off=not self.loop.driven)
         if self.loop.driven:
             self.end += f"; {UNCONFIRMED}: press the emergency stop"
         if self.policy:
@@ -376,8 +371,6 @@ class Session:
             time.sleep(0.01)
 
     def _check(self) -> None:
-        if self.guard:
-            self.guard.check()
         self.loop.check()
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")

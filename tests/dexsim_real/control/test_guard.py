@@ -4,6 +4,7 @@ import os
 import select
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,9 +20,9 @@ from following_hand import FollowingHand
 from pty_hand import QUICK
 
 from dexsim import load_hand
+from dexsim_real.control import guard
+from dexsim_real.control.guard import Guard
 from dexsim_real.core.errors import HandError
-from dexsim_real.run import guard
-from dexsim_real.run.guard import Guard
 
 
 @pytest.fixture
@@ -54,8 +55,10 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
     assert patience + guard._MOMENT < 1.0
     monkeypatch.setattr(guard, "_ANSWER", 20.0)  # A busy machine is not a suspended guard.
     watched = Guard(peer.port, QUICK, load_hand())
-    watched.arm()
     try:
+        assert select.select([watched._output], [], [], 20)[0]
+        watched.check()  # A node asks before its motors come on.
+        watched.arm()
         for _ in range(20):
             watched.beat()
             watched.check()
@@ -129,7 +132,8 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
             pass
 
     safety = Safety(hand, SafetyConfig())
-    servo = LoopThread(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
+    guard = SimpleNamespace(beat=events.append, dismiss=lambda off: events.append(off))
+    servo = LoopThread(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, guard)
     servo.driven = True
     servo.start()
     while events.count("exchange") < 20:
@@ -138,4 +142,4 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
     servo.stop()
     last = events.index(PATIENCE)
     assert events[:last:2] == [0.0] * (last // 2) and set(events[1:last:2]) <= {"exchange"}
-    assert events[last + 1 :] == ["answered"]
+    assert events[last + 1 :] == ["answered", True]

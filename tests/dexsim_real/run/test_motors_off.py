@@ -17,8 +17,8 @@ from following_hand import FollowingHand, arguments, summary
 from pty_hand import QUICK
 
 from dexsim import load_hand
+from dexsim_real.control.guard import Guard
 from dexsim_real.core.process import ignore_signals, stopping
-from dexsim_real.run.guard import Guard
 from dexsim_real.wire.frames import empty_state, passive_command
 from dexsim_real.wire.link import HandPort, Reply
 
