@@ -1,9 +1,6 @@
 """The driver with a scripted hand on a pseudo-terminal: faults, late answers, reconnection."""
 
-import contextlib
 import dataclasses
-import os
-import threading
 import time
 
 import memory_line
@@ -23,16 +20,13 @@ def command(position=0.5):
     return frames.command_block(np.full(12, position), kp=100, ki=0, kd=0, torque_max=300)
 
 
-@contextlib.contextmanager
-def opened(answer=None, config=QUICK, **options):
-    """A scripted hand and the driver whose port is open."""
-    with PtyHand(answer) as peer:
-        port = SerialHand(peer.port, config, **options)
-        port._open()
-        try:
-            yield peer, port
-        finally:
-            port.close()
+def memory_port(monkeypatch, peer, config=QUICK):
+    """A port to this hand over a line in memory, and the clock of both."""
+    clock = memory_line.Clock()
+    memory_line.connect(monkeypatch, peer, clock)
+    port = SerialHand("loop://", config)
+    port._open()
+    return port, clock
 
 
 def outcomes(counts):
@@ -92,8 +86,7 @@ def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound(monke
         return plan[index // 2](state.copy(), peer.whole())
 
     peer = PtyHand(answer)
-    memory_line.connect(monkeypatch, peer, memory_line.Clock())
-    port = SerialHand("loop://", QUICK)
+    port, _ = memory_port(monkeypatch, peer)
     port.connect()
     before = outcomes(port.counts)
     expected = dict.fromkeys(before, 0)
@@ -114,10 +107,8 @@ def test_a_late_answer_is_thrown_away(monkeypatch):
     def answer(index, block, state):
         state["joint"]["position"], peer.delay = index, 0.25 if index == 1 else 0.001
 
-    peer, clock = PtyHand(answer), memory_line.Clock()
-    memory_line.connect(monkeypatch, peer, clock)
-    port = SerialHand("loop://", QUICK)
-    port._open()
+    peer = PtyHand(answer)
+    port, clock = memory_port(monkeypatch, peer)
     assert port.exchange(command()) is not None
     assert port.exchange(command()) is None
     clock.sleep(0.4)  # Now it is there, and must not pass for the answer to the next request.
@@ -129,50 +120,38 @@ def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request(monkeypa
     def answer(index, block, state):
         state["joint"]["position"], peer.delay = index, (0.57, 0.25)[index]
 
-    config = dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True)  # 2514 bytes take 0.218 s.
     peer = PtyHand(answer)
-    memory_line.connect(monkeypatch, peer, memory_line.Clock())
-    port = SerialHand("loop://", config)
-    port._open()
+    # 2514 bytes take 0.218 s.
+    port, _ = memory_port(monkeypatch, peer, dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True))
     assert port.exchange(command()) is None
     assert port.exchange(command()).state["joint"]["position"][0] == 1
     assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
 
 
-def test_of_two_answers_at_once_the_newer_is_taken():
+def test_of_two_answers_at_once_the_newer_is_taken(monkeypatch):
     def answer(index, block, state):
         state["joint"]["position"] = 1
         older = peer.whole()
         state["joint"]["position"] = 2
         return older + peer.whole()
 
-    with opened(answer) as (peer, port):
-        read = port._read
-
-        def both():
-            data = b""
-            while len(data) < 2 * len(peer.whole()):
-                data += read()
-            return data
-
-        port._read = both
-        assert port.exchange(command()).state["joint"]["position"][0] == 2
-        assert port.counts == LinkCounts(sent=1, answered=1, late=1)
+    peer = PtyHand(answer)
+    port, _ = memory_port(monkeypatch, peer)
+    assert port.exchange(command()).state["joint"]["position"][0] == 2
+    assert port.counts == LinkCounts(sent=1, answered=1, late=1)
 
 
-def test_a_line_that_never_falls_silent_does_not_hold_the_driver():
-    with opened() as (peer, port):
-        stop = threading.Event()
+def test_a_line_that_never_falls_silent_does_not_hold_the_driver(monkeypatch):
+    peer = PtyHand(lambda index, block, state: b"\x55" * 1_000_000)
+    port, clock = memory_port(monkeypatch, peer)
+    read, begin = port._serial.read, clock.now
 
-        def babble():
-            while not stop.wait(0.0005):
-                os.write(peer.master, b"\x55" * 50)
+    def babble(size):
+        clock.sleep(0.0005)
+        return read(min(size, 50))
 
-        thread = threading.Thread(target=babble)
-        thread.start()
-        port.exchange(command())  # It returns.
-        stop.set()
-        thread.join()
+    port._serial.read = babble
+    assert port.exchange(command()) is None and clock.now - begin < 0.3
 
 
 def test_the_hand_goes_and_comes_back():

@@ -39,30 +39,18 @@ def calibration(hand, serial="2R32A001", handedness="right"):
     return dataclasses.replace(ideal_calibration(hand), serial=serial, handedness=handedness)
 
 
-@pytest.mark.parametrize(
-    ("identity", "known", "says"),
-    [
-        (
-            Identity("2R32B002", "right"),
-            ("2R32A001", "right"),
-            "this is hand 2R32B002, the calibration is of hand 2R32A001",
-        ),
-        (Identity(), ("2R32A001", "right"), "does not tell its serial number, the calibration is of hand 2R32A001"),
+def test_another_hand_is_refused_in_one_line_and_what_is_unknown_is_told(hand):
+    ours, unknown = calibration(hand), calibration(hand, "", "")
+    for identity, known, says in (
+        (Identity("2R32B002", "right"), ours, "this is hand 2R32B002, the calibration is of hand 2R32A001"),
+        (Identity(), ours, "does not tell its serial number, the calibration is of hand 2R32A001"),
         (Identity("2L32A001", "left"), None, "this is a left hand .* the model a right one"),
-    ],
-)
-def test_another_hand_is_refused_in_one_line(hand, identity, known, says):
-    with pytest.raises(HandError, match=says) as error:
-        check_identity(identity, hand, calibration(hand, *known) if known else None)
-    assert "\n" not in str(error.value)
-
-
-def test_the_hand_of_the_calibration_passes_and_what_is_unknown_is_told(hand):
-    assert check_identity(OURS, hand, calibration(hand)) == []
-    assert check_identity(OURS, hand, None) == []
-    (note,) = check_identity(OURS, hand, calibration(hand, "", ""))
-    assert "names no serial number" in note
-    for known in (None, calibration(hand, "", "")):
+    ):
+        with pytest.raises(HandError, match=f"{says}[^\n]*$"):
+            check_identity(identity, hand, known)
+    assert check_identity(OURS, hand, ours) == check_identity(OURS, hand, None) == []
+    assert "names no serial number" in check_identity(OURS, hand, unknown)[0]
+    for known in (None, unknown):
         (note,) = check_identity(Identity(), hand, known)
         assert "does not tell its serial number" in note
     assert "code 1" in check_identity(Identity("A001", "code 1"), hand, None)[0]
