@@ -8,14 +8,10 @@ from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import Reaction, Safety
-from dexsim_real.loop import ExchangeLoop
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire import frames
+from dexsim_real.control.safety import Reaction
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Refusal, Reply, read_refusal
+from dexsim_real.wire.link import read_refusal
 
-FINGER = ["thumb"] * 3 + ["index"] * 3 + ["middle"] * 2 + ["ring"] * 2 + ["pinky"] * 2
 ON = np.full(12, Mode.POSITION, np.uint8)
 JOINTS = np.arange(12)
 
@@ -108,9 +104,9 @@ def test_an_error_bit_holds_then_turns_the_motors_off_by_its_name(bench, joint, 
     for _ in range(3):
         decision = cycle(bench, errors=errors)
     assert decision.mode == Mode.PASSIVE and bench.safety.latched == decision.reason
-    name = ("palm", "joint", "tip")[board]
+    name, finger = ("palm", "joint", "tip")[board], {0: "thumb", 11: "pinky"}[joint]
     assert f"error bits 0x{1 << bit:04x} of the {name} board, joint" in decision.reason
-    assert f"({FINGER[joint]})" in decision.reason
+    assert f"({finger})" in decision.reason
 
 
 def test_error_bits_that_are_known_to_be_harmless_are_ignored(hand):
@@ -236,55 +232,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
 
 
 # --- refusals ------------------------------------------------------------------------------------
-
-
-class Refusing:
-    """A hand that answers `plan` in order: a state, a refusal, or silence (None)."""
-
-    def __init__(self, plan):
-        self.plan, self.sent, self.refusal, self.counts = plan, [], None, LinkCounts()
-
-    def exchange(self, command):
-        step = self.plan[min(len(self.sent), len(self.plan) - 1)]
-        self.sent.append(command)
-        self.refusal = step if isinstance(step, Refusal) else None
-        if step != "state":
-            return None
-        state = frames.empty_state()
-        state["joint"]["position"] = MIDDLE
-        state["joint"]["raw_position"] = command["mode"]
-        now = len(self.sent) * CYCLE
-        return Reply(state, now - CYCLE, now, len(self.sent), 1)
-
-
-def drive(hand, plan, cycles):
-    port, safety = Refusing(plan), Safety(hand, SafetyConfig())
-    loop = ExchangeLoop(port, HandSensing(hand, HardwareConfig()), safety, 83.0, clock=lambda: CYCLE * len(port.sent))
-    for _ in range(AGREEING):
-        loop.cycle()
-    loop.engage()
-    decisions = []
-    for _ in range(cycles):
-        loop.cycle()
-        decisions.append(safety.last)
-    return port, safety, decisions
-
-
-def test_a_hand_that_refuses_for_heat_is_turned_off_with_its_own_words(hand):
-    hot = read_refusal((1501028).to_bytes(4, "little"))
-    port, safety, _ = drive(hand, ["state"] * 15 + [hot, "state", hot, None, hot], 20)
-    assert safety.latched == "the hand reports over-temperature (1501028)"
-    on = [bool(np.all(command["mode"] == Mode.POSITION)) for command in port.sent]
-    assert on[10:20] == [True] * 10 and not any(on[20:])
-
-
-def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand):
-    """Silent first, then busy: the silence counts from its beginning."""
-    busy = read_refusal(b"\x06\x00")
-    _, safety, decisions = drive(hand, ["state"] * 35 + [None] * 50 + [busy], 150)
-    assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
-    held = [k for k, (reaction, _) in enumerate(decisions) if reaction == Reaction.HOLD]
-    assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in decisions
 
 
 @pytest.mark.parametrize(
