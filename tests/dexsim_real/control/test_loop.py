@@ -29,8 +29,10 @@ class Hand(HandPort):
         sent, self.now = self.now, self.now + CYCLE
         step = self.plan.pop(0) if self.plan else "state"
         self.refusal = step if isinstance(step, Refusal) else None
+        if isinstance(step, BaseException):
+            raise step
         if sent < self.silent_until or step != "state":
-            return None
+            return step if isinstance(step, bool) else None
         self.modes.append(int(command["mode"][0]))
         state = frames.empty_state()
         state["joint"]["position"], state["joint"]["raw_position"] = MIDDLE, command["mode"]
@@ -44,7 +46,7 @@ class Hand(HandPort):
 def loop(hand, monkeypatch):
     """Its cycles are called one by one, in the clock of its hand."""
     port = Hand()
-    clock = SimpleNamespace(monotonic=lambda: port.now)
+    clock = SimpleNamespace(monotonic=lambda: port.now, sleep=lambda seconds: None)
     monkeypatch.setattr("dexsim_real.wire.link.time", clock)
     monkeypatch.setattr("dexsim_real.loop.ignore_signals", lambda: None)
     safety = Safety(hand, SafetyConfig())
@@ -99,6 +101,16 @@ def test_a_hand_that_is_on_and_silent_is_told_for_five_seconds(loop, on, silence
     assert port.closed and loop.driven == (on and not confirmed)
     assert (port.modes[-1] == Mode.PASSIVE) == (confirmed or not on)
     assert port.now - began == pytest.approx(silence if confirmed else 5.0 if on else 0.3, abs=0.1)
+
+
+def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms(loop):
+    """A procedure has no guard process: an error of the driver must not leave the motors on."""
+    port, off, gone = loop.port, frames.passive_command(), OSError("the adapter is gone")
+    port.plan = [gone, None, False, SystemExit(1)]
+    assert port.turn_off(off, 5.0) and not port.plan
+    for answer in (gone, False, True):
+        port.plan = [answer] * 100
+        assert not port.turn_off(off, 0.05)
 
 
 def test_a_command_without_an_answer_may_have_turned_the_motors_on(loop):

@@ -19,8 +19,6 @@ from pty_hand import QUICK
 from dexsim import load_hand
 from dexsim_real.control.guard import Guard
 from dexsim_real.core.process import ignore_signals, stopping
-from dexsim_real.wire.frames import empty_state, passive_command
-from dexsim_real.wire.link import HandPort, Reply
 
 
 def runner(peer, folder, *without):
@@ -88,30 +86,22 @@ def test_only_the_first_signal_interrupts():
 
 def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
     """Interrupted while the cable is out: the motors go off when it returns, a second later. The guard lets it try."""
-    with FollowingHand() as peer:
-        process = runner(peer, tmp_path, "--no-guard")
-        try:
-            wait(lambda: peer.on().sum() > 60)
-            peer.close()
-            time.sleep(0.2)
-            process.send_signal(signal.SIGINT)
-            time.sleep(1.0)
-            assert process.poll() is None
-            peer.open()
-            asked = len(peer.commands)
-            assert process.wait(20) == 130
-            assert len(peer.commands) > asked and not peer.on()[asked:].any()
-        finally:
-            process.kill()
-            process.communicate()
+    with moving(tmp_path, "--no-guard") as (peer, process):
+        peer.close()
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        time.sleep(1.0)
+        assert process.poll() is None
+        peer.open()
+        asked = len(peer.commands)
+        assert process.wait(20) == 130
+        assert len(peer.commands) > asked and not peer.on()[asked:].any()
     assert summary(tmp_path)["motors_off"]
 
 
 @pytest.mark.slow
 def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
-    with FollowingHand() as peer:
-        process = runner(peer, tmp_path, "--no-guard")
-        wait(lambda: peer.on().sum() > 60)
+    with moving(tmp_path, "--no-guard") as (peer, process):
         peer.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 1
@@ -119,29 +109,8 @@ def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
         peer.open()
         wait(lambda: len(peer.commands) > asked, 20.0)
         assert not peer.on()[asked:].any()
-        process.communicate()
     report = summary(tmp_path)
     assert not report["motors_off"] and "press the emergency stop" in report["end"]
-
-
-def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
-    """A procedure has no guard process: an error of the driver must not leave the motors on."""
-
-    class Failing(HandPort):
-        def __init__(self, answers):
-            self.answers = answers
-
-        def exchange(self, command):
-            answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-            if isinstance(answer, BaseException):
-                raise answer
-            return answer
-
-    gone, reply = OSError("the adapter is gone"), Reply(empty_state(), 0.0, 0.0, 1, 1)
-    port = Failing([gone, None, False, SystemExit(1), reply])
-    assert port.turn_off(passive_command(), 5.0) and port.answers == [reply]
-    for answer in (gone, False, True):
-        assert not Failing([answer]).turn_off(passive_command(), 0.05)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])

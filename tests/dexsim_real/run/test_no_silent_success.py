@@ -1,8 +1,6 @@
 """A run or a calibration that lacks something says so and does not end with exit code 0."""
 
 import dataclasses
-import errno
-import os
 import socket
 import threading
 import time
@@ -16,7 +14,6 @@ from following_hand import FollowingHand, arguments, summary
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
-from dexsim_real.core import log
 from dexsim_real.core.log import LogWriter
 from dexsim_real.run import __main__ as run
 from dexsim_real.run.session import Outcome
@@ -91,27 +88,6 @@ def test_a_camera_that_is_lost(tmp_path):
     assert summary(tmp_path)["end"] == "stopped: the camera sends no more pictures for 0.3 s"
 
 
-def full_after(monkeypatch, size):
-    """A disk that takes this many bytes of logs."""
-    real, left = log._write_all, [size]
-
-    def write(file, data):
-        left[0] -= len(data)
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(file, data)
-
-    monkeypatch.setattr(log, "_write_all", write)
-
-
-def test_a_full_disk(tmp_path, capsys, monkeypatch):
-    full_after(monkeypatch, 100_000)
-    with FollowingHand() as peer:
-        assert run.main(arguments(peer, tmp_path, "--seconds", "0.5")) == 1
-    (line,) = lines(capsys)
-    assert f"{summary(tmp_path)['log_dropped']} log records are lost" in line and "No space left on device" in line
-
-
 def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
     """A tenth of the time without a measurement, half of it held or with the motors off."""
     with LogWriter(tmp_path / "a.log") as writer:
@@ -132,3 +108,5 @@ def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
         assert line == "the hand was held for 51 % of the run, last because: a joint is too fast"
     safety.refuse(Refusal("the hand reports busy", serious=False))
     assert missing(blind=50) == ["no measurement for 50 % of the run (the hand reports busy)"]
+    writer.dropped, writer.failure = 3, "No space left on device"
+    assert missing() == ["3 log records are lost (No space left on device)"]
