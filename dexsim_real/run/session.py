@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
+from rich.table import Table
 
 from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
@@ -32,7 +33,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
 from dexsim_real.loop import LoopOptions, LoopThread, Pace, keep_phase
-from dexsim_real.run.status import HandState, StatusView
+from dexsim_real.run.status import StatusView, hand_tables
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import UPRIGHT_X, Imu
@@ -242,7 +243,7 @@ class Session:
         rate = keep_phase(arguments.rate, policy.control_rate)
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, guard)
         self.loop.retared = self._retare
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self._hand_tables, arguments.quiet)
         self.policy: PolicyLoop | None = None  # from `prepare` on
         self.pace = Pace(policy.control_rate)
         self.started = 0.0
@@ -346,13 +347,13 @@ class Session:
             summary |= {"successes": policy.goals.successes, "success_times": times}
         return summary
 
-    def hand_state(self) -> HandState | None:
-        """What the view shows of the hand; None without a measurement. Called from the view's thread."""
+    def _hand_tables(self) -> Table | str:
+        """What the view shows of the hand; empty without a measurement. Called from the view's thread."""
         sample, sent = self.safety.sample, self.safety.last[0] != Reaction.RELAX
         if sample is None:
-            return None
+            return ""
         target = self.safety.commanded if sent else self.newest.target if self.newest else None
-        return HandState(self.sensing.hand, sample.measured, target, sent)
+        return hand_tables(self.sensing.hand, sample.measured, target, sent)
 
     def _await_pose(self) -> None:
         """Check that a hand answers plausibly now."""

@@ -35,8 +35,9 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
     joint["palm_error"][3], joint["joint_error"][3], joint["tip_error"][11] = 0x0101, 0xFFFF, 0x8000
     tip["taxel"]["z"][:, :3] = np.arange(200, 205)[:, None]
     tip["temperature"] = np.arange(121, 126)
-    state = status.HandState(hand, HandSensing(hand, HardwareConfig()).measure(block), np.linspace(-2, 1.8, 12), True)
-    view = status.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: state)
+    measured, targets = HandSensing(hand, HardwareConfig()).measure(block), np.linspace(-2, 1.8, 12)
+    tables = status.hand_tables(hand, measured, targets, True)
+    view = status.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables)
     view.console = Console(width=100, file=io.StringIO())
     view.show()
     shown = view.console.file.getvalue()
@@ -44,13 +45,13 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
     assert len(lines) <= 29 and "…" not in shown
     for number, name in enumerate(hand.joint_names):
         errors = {3: "0101 ffff -", 11: "- - 8000"}.get(number, "- - -")
-        row = f"{number} {name} {joint['position'][number]:.3f} {state.target[number]:.3f} {1.11 + 0.01 * number:.2f}"
+        row = f"{number} {name} {joint['position'][number]:.3f} {targets[number]:.3f} {1.11 + 0.01 * number:.2f}"
         assert any(" ".join(line.split()).startswith(f"{row} {101 + number} {errors}") for line in lines), row
     for finger, name in enumerate(hand.finger_names):
         assert re.search(rf"{name} +{60 + 0.3 * finger:.1f} +{121 + finger}$", shown, re.MULTILINE)
     assert re.search(r"sum +303.0 *$", shown, re.MULTILINE) and re.search(r"palm board +42$", shown, re.MULTILINE)
     assert "not sent" not in shown
-    state = state._replace(target=None, sent=False)
+    tables = status.hand_tables(hand, measured, None, False)
     view.show()
     assert "(not sent)" in view.console.file.getvalue()
 
@@ -74,7 +75,7 @@ def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
     far, near = os.openpty() if gone == "window" else os.pipe()
     screen = os.fdopen(near, "w", buffering=1)
     monkeypatch.setattr("sys.stderr", screen)
-    view = status.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: None)
+    view = status.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "")
     os.close(far)
     try:
         view.note("before")
