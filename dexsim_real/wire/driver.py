@@ -114,10 +114,7 @@ class DriverPort(ReconnectingPort):
         self.driver.close()
 
     def _reopen(self) -> None:
-        try:
-            self.connect()
-        except HandError as error:
-            raise OSError from error
+        self.connect()
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1

@@ -265,7 +265,10 @@ class ReconnectingPort(HandPort):
                 if self._clock() < self._retry_at:
                     self._sleep(_PAUSE)
                     return None
-                self._reopen()
+                try:
+                    self._reopen()
+                except HandError as error:
+                    raise OSError from error
                 self.counts.reconnects += 1
                 self._returning, self._pause = True, self.config.backoff[0]
             reply = self._exchange(self.passive if self._returning else command)
@@ -282,5 +285,5 @@ class ReconnectingPort(HandPort):
         raise NotImplementedError
 
     def _reopen(self) -> None:
-        """Open the line to the hand that was there before. OSError: it is still gone."""
+        """Open the line to the hand that was there before. OSError or HandError: it is still gone."""
         raise NotImplementedError

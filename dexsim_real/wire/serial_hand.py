@@ -220,11 +220,8 @@ class SerialHand(ReconnectingPort):
         return f"{self.port}: {why}"
 
     def _reopen(self) -> None:
-        try:
-            self._open()
-            self._handshake(0.0)
-        except HandError as error:
-            raise OSError from error
+        self._open()
+        self._handshake(0.0)
         if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
             text = f"another hand is on {self.port}: {identity}, not {self.identity}"
             self.refusal = Refusal(text, serious=True)
