@@ -41,7 +41,7 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert [tick["readings"]["command"] for tick in ticks] == [np.float32(0.6)] * len(ticks)
     for before, after in zip(ticks[:-1], ticks[1:], strict=True):
         assert after["readings"]["last_action"].tobytes() == before["action"].tobytes()
-    again = replay.replay(tmp_path / "run.log").report
+    again = replay.Replay(tmp_path / "run.log").report
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
     drawn_by_finger(hand, tmp_path, ticks)
@@ -122,7 +122,7 @@ def forged(folder):
         return content
 
     path = rewritten(folder, flip)
-    report = replay.replay(path).report
+    report = replay.Replay(path).report
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
     assert replay.main([str(path)]) == 1
     for of, name, value in (
@@ -133,7 +133,7 @@ def forged(folder):
         forge = lambda kind, content: {**content, name: value} if kind == of and name in content else content  # noqa: B023, E731
         path = rewritten(folder, forge)
         with pytest.raises(LogError, match=f"^{path}: invalid record") as error:
-            replay.replay(path)
+            replay.Replay(path)
         assert "\n" not in str(error.value)
 
 
@@ -157,7 +157,7 @@ def test_a_log_of_another_command_is_named_with_the_command_that_reads_it(tmp_pa
 
 
 def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "replay", lambda *_: pytest.fail("the replay began"))
+    monkeypatch.setattr(replay, "Replay", lambda *_: pytest.fail("the replay began"))
     log = str(tmp_path / "run.log")
     (tmp_path / "taken.png").mkdir()
     for option in ("--plot", "--rrd", "--output"):

@@ -113,7 +113,7 @@ def test_a_left_hand_runs_the_policy_of_the_right_one_and_a_right_hand_is_refuse
             run.main(arguments(peer, tmp_path / "refused", *options))
         peer.registers = {20: b"left", 21: b"2L32SCRIPTED"}
         assert run.main(arguments(peer, tmp_path, *options)) == 0
-    again = replay.replay(tmp_path / "run.log")
+    again = replay.Replay(tmp_path / "run.log")
     assert again.hand.name == "xhand_left" and again.report["first_difference"] is None
 
 
@@ -147,7 +147,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
     link = summary(tmp_path)["link"]
     assert link["corrupt"] + link["silent"] == len(faults) > 5 and link["late"] == 0
     assert link["sent"] == sum(link[end] for end in ("answered", "corrupt", "silent", "refused", "lost"))
-    assert replay.replay(tmp_path / "run.log").report["first_difference"] is None
+    assert replay.Replay(tmp_path / "run.log").report["first_difference"] is None
 
 
 @pytest.mark.parametrize(
