@@ -17,7 +17,7 @@ from dexsim_real.core.errors import HandError, find_function, open_serial
 from dexsim_real.wire import frames, link
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
-from dexsim_real.wire.link import HandPort, Identity, LinkConfig, ReconnectingPort, Refusal, Reply
+from dexsim_real.wire.link import HandPort, Identity, LinkConfig, Refusal, Reply
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -28,11 +28,11 @@ _REGISTER = 34  # bytes of the answer: number and content
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
 
-class SerialHand(ReconnectingPort):
+class SerialHand(HandPort):
     """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
     `identity` is what the hand told about itself when it was connected. Another hand on the port is refused: it is told
-    to turn its motors off, and nothing else. `options` are those of `ReconnectingPort`.
+    to turn its motors off, and nothing else. `options` are those of `HandPort`.
     """
 
     def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
