@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import gc
 import hashlib
-import math
 import sys
 import termios
 import time
@@ -101,8 +100,6 @@ class RunArguments(LoopOptions):
 
     def __post_init__(self):
         super().__post_init__()
-        if math.hypot(*self.imu_mount) < 1e-3:
-            raise HandError(f"--imu-mount {' '.join(f'{v:g}' for v in self.imu_mount)}: is no orientation (w, x, y, z)")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")
 
@@ -184,33 +181,30 @@ def execute(arguments: RunArguments) -> RunResult:
 class Outcome:
     """Whether a run did what it was started for: a hand that was gone or held, or lost records, are no success."""
 
-    def __init__(self, began: float = 0.0):
-        self._began = self._last = began
-        self._blind = self._held = 0.0  # s
-        self._actions = self._wrong = 0
+    def __init__(self) -> None:
+        self._ticks = self._blind = self._held = self._wrong = 0
         self._reason = self._silence = ""  # of the newest hold, and of the newest refusal
 
-    def add(self, now: float, target: np.ndarray | None, safety: Safety) -> None:
-        """Count the time up to `now` s; `target` [J] is the policy's, None when no measurement was young enough."""
-        step, self._last = now - self._last, now
+    def add(self, target: np.ndarray | None, safety: Safety) -> None:
+        """Count a tick; `target` [J] is the policy's, None when no measurement was young enough."""
+        self._ticks += 1
         if target is None:
-            self._blind += step
+            self._blind += 1
             self._silence = safety.refused or self._silence
         else:
-            self._actions += 1
             self._wrong += not np.isfinite(target).all()
         reaction, reason = safety.last
         if safety.engaged and reaction >= Reaction.HOLD:
-            self._held += step
+            self._held += 1
             self._reason = reason
 
     def missing(self, log: LogWriter) -> list[str]:
         """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
-        total = max(self._last - self._began, 1e-9)
-        blind, held, why = self._blind / total, self._held / total, f" ({self._silence})" if self._silence else ""
+        total, why = max(self._ticks, 1), f" ({self._silence})" if self._silence else ""
+        blind, held, actions = self._blind / total, self._held / total, self._ticks - self._blind
         lines = {
             f"no measurement for {100 * blind:.0f} % of the run{why}": blind > _BLIND,
-            f"{self._wrong} of {self._actions} actions of the policy were not finite": self._wrong,
+            f"{self._wrong} of {actions} actions of the policy were not finite": self._wrong,
             f"the hand was held for {100 * held:.0f} % of the run, last because: {self._reason}": held > _HELD,
             log.losses: log.losses,
         }
@@ -379,7 +373,6 @@ class Session:
     def _run_policy(self, policy: PolicyLoop) -> None:
         """Tick until the time is over."""
         self.started = time.monotonic()
-        self.outcome = Outcome(self.started)
         self.loop.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -387,7 +380,7 @@ class Session:
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
             tick = policy.tick(now)
-            self.outcome.add(now, tick.target if tick else None, self.safety)
+            self.outcome.add(tick.target if tick else None, self.safety)
             if tick is not None:
                 self.newest = tick
                 fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}

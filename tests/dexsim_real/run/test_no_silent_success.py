@@ -95,10 +95,10 @@ def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
     safety = Safety(hand, SafetyConfig())
 
     def missing(blind=0, held=0, reaction=Reaction.HOLD, engaged=True):
-        outcome, safety.engaged = Outcome(5.0), engaged
+        outcome, safety.engaged = Outcome(), engaged
         for k in range(100):
             safety.last = (reaction, "a joint is too fast") if k < held else (Reaction.CLIP, "")
-            outcome.add(5.0 + (k + 1) / 100, None if k < blind else np.zeros(12), safety)
+            outcome.add(None if k < blind else np.zeros(12), safety)
         return outcome.missing(writer)
 
     assert missing() == missing(9, 49) == missing(held=100, engaged=False) == []
