@@ -11,6 +11,7 @@ from test_safety import AGREEING, CYCLE, MIDDLE
 
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.core.errors import HandError
 from dexsim_real.loop import GRACE, LoopThread, Pace, keep_phase
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
@@ -101,6 +102,26 @@ def test_a_hand_that_is_on_and_silent_is_told_for_five_seconds(loop, on, silence
     assert port.closed and loop.driven == (on and not confirmed)
     assert (port.modes[-1] == Mode.PASSIVE) == (confirmed or not on)
     assert port.now - began == pytest.approx(silence if confirmed else 5.0 if on else 0.3, abs=0.1)
+
+
+def test_the_guard_is_armed_before_the_motors_come_on_and_told_whether_they_are_off(loop):
+    def fail():
+        raise HandError("the guard")
+
+    told = []
+    loop.guard = SimpleNamespace(beat=lambda more: None, dismiss=lambda off: told.append(off), check=fail, arm=fail)
+    run(loop, AGREEING)
+    for call in (loop.engage, loop.check):
+        with pytest.raises(HandError, match="the guard"):
+            call()
+    run(loop, 1)
+    assert not loop.safety.engaged
+    loop.guard.arm = lambda: None
+    loop.engage()
+    run(loop, 2)
+    loop.port.silent_until = loop.port.now + 9.0
+    loop.stop()
+    assert told == [False] and loop.driven
 
 
 def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms(loop):
