@@ -1,5 +1,6 @@
 """The simulation and the bridge give the same observation, in the same order of action and sensing."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from remembering import remembering
+from simple_physics import SimplePhysics
 
 pytest.importorskip("serial")
 from dexsim.control import Control
@@ -16,7 +18,7 @@ from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
-from dexsim.physics.interface import PhysicsState, StepResult
+from dexsim.physics.interface import StepResult
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
@@ -42,28 +44,15 @@ QUIET = Sensing(
 )
 
 
-class FakePhysics:
-    """Joints that follow torque like a first-order lag and an object that turns: `Env` around it is the real one."""
+class Turning(SimplePhysics):
+    """Its object is touched where it stays, and turns about x."""
 
-    def __init__(self, hand, slots, largest, config, **options):
-        self.backend, self.config = "jax", config
-        self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
-        self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
-        self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
-
-    def tip_stiffness(self, *arguments):
-        return jnp.ones(5)
-
-    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta, held):
-        joints, velocity = state.qpos[:12], state.qvel[:12]
-        torque = law(jnp.asarray(5), joints, velocity)
-        velocity = torque * 2.0
-        joints = joints + self.config.control_period * velocity
+    def advance(self, law, object, state, *others):
+        result = super().advance(law, object, state, *others)
         turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
-        qpos = jnp.concatenate([joints, state.qpos[12:15], turned])
-        qvel = jnp.concatenate([velocity, jnp.zeros(6)])
-        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * joints[:5])) * 3)
-        return StepResult(PhysicsState(qpos, qvel, state.warmstart), force)
+        qpos = jnp.concatenate([result.state.qpos[:12], state.qpos[12:15], turned])
+        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * qpos[:5])) * 3)
+        return StepResult(dataclasses.replace(result.state, qpos=qpos), force)
 
 
 class StillRotate(Rotate):
@@ -140,7 +129,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
 
 def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
     """The real `Env.step` over simple physics, and the bridge fed with frames of what that hand measured."""
-    monkeypatch.setattr("dexsim.env.env.Physics", FakePhysics)
+    monkeypatch.setattr("dexsim.env.env.Physics", Turning)
     config = RotateConfig(
         sensing=QUIET,
         randomization=Randomization(scale=0.0),
