@@ -4,8 +4,6 @@ The joints are moved by the motors of the emulated hand, without friction, which
 gives targets all the time. The cable comes out and back, and whenever `Safety` has ended a run, a new one starts.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, SOFT
@@ -24,28 +22,8 @@ LENGTH = 30  # answers in which the angles of a fault are wrong, some or all
 ANGLES = (spike, huge, several, drift, noise, swapped)
 
 
-def hot(rng, joints, tips):
-    joints["temperature"][rng.integers(12)] = 255
-
-
-def current(rng, joints, tips):
-    joints["current"][rng.integers(12)] = -3000
-
-
-def error_bits(rng, joints, tips):
-    joints["joint_error"][rng.integers(12)] = 4
-
-
-def no_mode(rng, joints, tips):
-    joints["raw_position"] = 0
-
-
-def touch(rng, joints, tips):
-    tips["taxel"]["z"][rng.integers(5), :60] = 9  # 54 N
-
-
-OTHERS = {hot: 1, current: 5, error_bits: 3, no_mode: 3, touch: 10}
-"""Faults of what is no angle, and in how many answers each is."""
+# Faults of what is no angle: what a joint or 60 taxels of a fingertip read, and in how many answers.
+OTHERS = dict(temperature=(255, 1), current=(-3000, 5), joint_error=(4, 3), raw_position=(0, 3), taxel=(9, 10))
 
 
 class Faulty(HandPort):
@@ -114,8 +92,10 @@ class Faulty(HandPort):
         if self._left:
             self._left -= 1
             self._past.append(self.hands.angle[0].copy())
-            if self._other:
-                self._other(self.rng, joints, tips)
+            if self._other == "taxel":
+                tips["taxel"]["z"][self.rng.integers(5), :60] = OTHERS["taxel"][0]  # 54 N
+            elif self._other:
+                joints[self._other][self.rng.integers(12)] = OTHERS[self._other][0]
             else:
                 joints["position"] = self._angles(len(self._past) - 1, self._past)
         self.wrong += state.tobytes() != sound.tobytes()
@@ -129,13 +109,7 @@ class Faulty(HandPort):
             self._angles, self._left = self.rng.choice(ANGLES)(self.rng), LENGTH
         else:
             self._other = self.rng.choice(list(OTHERS))
-            self._left = int(self.rng.integers(1, OTHERS[self._other] + 1))
-
-
-class Soak(NamedTuple):
-    port: Faulty
-    starts: int
-    ends: dict
+            self._left = int(self.rng.integers(1, OTHERS[self._other][1] + 1))
 
 
 def soak(hand, minutes, share, speed, seed=0):
@@ -157,7 +131,7 @@ def soak(hand, minutes, share, speed, seed=0):
         port.sink()
         reason = safety.latched.partition(":")[0]
         ends[reason] = ends.get(reason, 0) + 1
-    return Soak(port, starts, ends)
+    return port, starts, ends
 
 
 @pytest.mark.parametrize(
