@@ -104,12 +104,15 @@ def test_a_hand_that_is_on_and_silent_is_told_for_five_seconds(loop, on, silence
     assert port.now - began == pytest.approx(silence if confirmed else 5.0 if on else 0.3, abs=0.1)
 
 
-def test_the_guard_is_armed_before_the_motors_come_on_and_told_whether_they_are_off(loop):
+def test_the_guard_is_armed_gets_signs_of_life_and_is_told_whether_the_motors_are_off(loop):
+    """Before every exchange, and once more with the time that turning the motors off may take."""
+
     def fail():
         raise HandError("the guard")
 
-    told = []
-    loop.guard = SimpleNamespace(beat=lambda more: None, dismiss=lambda off: told.append(off), check=fail, arm=fail)
+    told, signs, begin = [], [], loop.port.now
+    beat = lambda more: signs.append((more, loop.port.now))  # noqa: E731
+    loop.guard = SimpleNamespace(beat=beat, dismiss=lambda off: told.append(off), check=fail, arm=fail)
     run(loop, AGREEING)
     for call in (loop.engage, loop.check):
         with pytest.raises(HandError, match="the guard"):
@@ -119,9 +122,11 @@ def test_the_guard_is_armed_before_the_motors_come_on_and_told_whether_they_are_
     loop.guard.arm = lambda: None
     loop.engage()
     run(loop, 2)
+    assert [sign for sign, _ in signs] == [0.0] * (AGREEING + 3)
+    np.testing.assert_allclose([now for _, now in signs], begin + CYCLE * np.arange(AGREEING + 3))
     loop.port.silent_until = loop.port.now + 9.0
     loop.stop()
-    assert told == [False] and loop.driven
+    assert signs[AGREEING + 3][0] == PATIENCE and told == [False] and loop.driven
 
 
 def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms(loop):
