@@ -130,12 +130,7 @@ class Controller:
 
     def resume(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad after a hold, perhaps with the object put back: the past is forgotten."""
-        self.anchor(position)
-        self.carry = self.policy.initial_carry()
-
-    def anchor(self, position: np.ndarray) -> None:
-        """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
-        self.target = np.asarray(position, np.float32)
+        self.target, self.carry = np.asarray(position, np.float32), self.policy.initial_carry()
 
     def tick(self, measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Readings, observation, action and joint targets; `goal_quat` [4] of the object, grip command in [0, 1]."""

@@ -60,7 +60,7 @@ class Record:
     content: Any  # dict with NumPy arrays, text, or (number, frame), by `kind`
 
 
-class LogWriter:
+class LogWriter(contextlib.AbstractContextManager):
     """Accepts records from any thread without blocking. A context manager.
 
     A full disk ends the log, not the run: `failure` has the reason and `dropped` counts the lost records.
@@ -89,9 +89,6 @@ class LogWriter:
         if not (self.dropped or self.failure):
             return ""
         return f"{self.dropped} log records are lost ({self.failure or 'the disk is too slow'})"
-
-    def __enter__(self) -> "LogWriter":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

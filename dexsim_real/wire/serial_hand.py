@@ -41,7 +41,6 @@ class SerialHand(HandPort):
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
-        self._others = 0  # frames of other hands
 
     def connect(self) -> str:
         """Open the port and identify the hand; see `HandPort.connect`."""
@@ -158,9 +157,7 @@ class SerialHand(HandPort):
         Other addresses pass: no capture of a real hand's replies is published.
         """
         own = frames.palm_address(self.config.hand_id)
-        mine = [frame for frame in answers if frame.source == own or frame.source not in frames.PALMS]
-        self._others += len(answers) - len(mine)
-        return mine
+        return [frame for frame in answers if frame.source == own or frame.source not in frames.PALMS]
 
     # --- opening and reopening --------------------------------------------------------------
 
@@ -208,15 +205,13 @@ class SerialHand(HandPort):
         elif counts.late:
             why = f"answers come too late; raise --link.margin (now {config.margin:g} s), or check the latency timer"
             why += "; an emulated line without the timing of the wire needs --link.no-paced"
-        elif self._others:
-            why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
         elif self.refusal is not None:
             why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
         elif not self._parser.frames and not self._parser.damaged:
             why = f"no bytes belong to a frame; set --link.baud to that of the hand (now {config.baud} baud)"
         else:
             what = f"{counts.crc_errors} wrong checksums, {counts.refused} refusals"
-            why = f"the hand answers without a valid state ({what}); check cable and termination"
+            why = f"no valid state ({what}); check cable, termination and --link.hand-id (now {config.hand_id})"
         return f"{self.port}: {why}"
 
     def _reopen(self) -> None:

@@ -215,7 +215,7 @@ def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_
             carry = policy.initial_carry()
             (controller.start if number == 3 else controller.resume)(measured.joint_position)
         if number == 5:
-            controller.anchor(measured.joint_position)  # with the motors off, at every tick
+            controller.target = measured.joint_position  # with the motors off, at every tick
         if number in (3, 5, 6):
             np.testing.assert_array_equal(controller.target, measured.joint_position)
         tick = controller.tick(measured, seen, IDENTITY, 0.5)
@@ -235,7 +235,7 @@ class Still:
     def start(self, target):
         self.target = target
 
-    resume = anchor = start
+    resume = start
 
     def tick(self, measured, estimate, goal, command):
         return Tick(None, None, np.zeros(12), MIDDLE)

@@ -201,7 +201,7 @@ OTHER = Frame(0x81, 0xFE, Command.EXCHANGE, empty_state().tobytes()).encode()
         (b"", "no answer.*power"),
         (b"\x13\x37" * 40, "--link.baud .*3000000 baud"),
         (ERROR, "unknown command .1501002.; power-cycle"),
-        (OTHER, "no hand with the id 0; check --link.hand-id"),
+        (OTHER, "no valid state .* --link.hand-id"),
     ],
 )
 def test_why_a_hand_does_not_answer(answer, says):
