@@ -181,10 +181,6 @@ class LoopThread(ExchangeLoop):
             why = self.error if isinstance(self.error, HandError) else repr(self.error)
             raise HandError(f"the exchange thread failed: {why}")
 
-    def forget(self) -> None:
-        """Reset the timing statistics, to exclude the start."""
-        self.pace.jitter, self.round_trip = Timing(), Timing()
-
     def free(self, now: float) -> float:
         """The next time s at which a request has just been sent and the interpreter is idle until its answer."""
         lead, period = 0.001, self.pace.period

@@ -90,10 +90,6 @@ class HandNode:
             log(line)
         self.loop.start()
 
-    def close(self) -> None:
-        """Turn the motors off and close the port."""
-        self.loop.stop()
-
     def switch(self, request: Any, response: Any) -> Any:
         """The service: motors on, or off for good."""
         if request.data:
@@ -158,7 +154,7 @@ def main(argv: Any = None) -> int:
         hand.start()
         rclpy.spin(node)
     finally:
-        hand.close()
+        hand.loop.stop()  # The motors go off.
         node.destroy_node()
         rclpy.try_shutdown()
     return 0

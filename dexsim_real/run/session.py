@@ -31,7 +31,7 @@ from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
-from dexsim_real.loop import LoopOptions, LoopThread, Pace, keep_phase
+from dexsim_real.loop import LoopOptions, LoopThread, Pace, Timing, keep_phase
 from dexsim_real.run.status import StatusView, hand_tables
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
@@ -373,7 +373,7 @@ class Session:
     def _run_policy(self, policy: PolicyLoop) -> None:
         """Tick until the time is over."""
         self.started = time.monotonic()
-        self.loop.forget()
+        self.loop.pace.jitter, self.loop.round_trip = Timing(), Timing()  # without those of the start
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
         self.pace.next = self.loop.free(self.pace.next)
