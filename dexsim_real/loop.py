@@ -88,7 +88,8 @@ class ExchangeLoop:
         self.command = self.sensing.command(decision.position, decision.mode, decision.stiffness)
         reply = self.port.exchange(self.command)
         if reply is None:
-            self.safety.refuse(self.port.refusal)
+            if self.port.refusal:
+                self.safety.alarms.refuse(self.port.refusal)
             return None
         self.driven = on
         self.round_trip.add(reply.received - reply.sent)

@@ -190,7 +190,7 @@ class Outcome:
         self._ticks += 1
         if target is None:
             self._blind += 1
-            self._silence = safety.refused or self._silence
+            self._silence = safety.alarms.refused or self._silence
         else:
             self._wrong += not np.isfinite(target).all()
         reaction, reason = safety.last
@@ -354,7 +354,7 @@ class Session:
         if self.loop.wait_fresh(1.0) is None:
             self.loop.check()
             problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
-            silence = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            silence = self.safety.alarms.refused or "the hand stopped answering; check the cable and the power"
             raise HandError(f"{self.arguments.port}: {problem or silence}")
 
     def _await_motors(self) -> None:

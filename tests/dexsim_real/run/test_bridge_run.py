@@ -320,7 +320,7 @@ def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
     for reaction in (Reaction.HOLD, Reaction.RELAX):
         (line,) = missing(held=51, reaction=reaction)
         assert line == "the hand was held for 51 % of the run, last because: a joint is too fast"
-    safety.refuse(Refusal("the hand reports busy", serious=False))
+    safety.alarms.refuse(Refusal("the hand reports busy", serious=False))
     assert missing(blind=50) == ["no measurement for 50 % of the run (the hand reports busy)"]
     writer.dropped, writer.failure = 3, "No space left on device"
     assert missing() == ["3 log records are lost (No space left on device)"]
