@@ -53,14 +53,7 @@ class Guard:
     def __init__(self, port: str, link: LinkConfig, hand: Hand):
         root = str(Path(__file__).resolve().parents[2])
         self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "dexsim_real.control.guard",
-                port,
-                json.dumps(dataclasses.asdict(link)),
-                hand.source,
-            ],
+            [sys.executable, "-m", __name__, port, json.dumps(dataclasses.asdict(link)), hand.source],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
