@@ -162,7 +162,7 @@ class LoopThread(ExchangeLoop):
     def __init__(self, *parts: Any, **options: Any):
         super().__init__(*parts, **options)
         self.error: BaseException | None = None
-        self._stop, self._fresh = threading.Event(), threading.Event()
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="exchange", daemon=True)
 
     def start(self) -> None:
@@ -187,11 +187,6 @@ class LoopThread(ExchangeLoop):
         lead, period = 0.001, self.pace.period
         return now + (self.pace.next + lead - now) % period
 
-    def wait_fresh(self, seconds: float) -> HandSample | None:
-        """Wait for the next plausible sample; None when none arrives in time."""
-        self._fresh.clear()
-        return self.safety.sample if self._fresh.wait(seconds) else None
-
     def stop(self) -> None:
         """End the thread, and turn the motors off."""
         ignore_signals()
@@ -208,8 +203,7 @@ class LoopThread(ExchangeLoop):
         try:
             self.pace.next = self.clock() + self.pace.period
             while not self._stop.is_set():
-                if self.cycle() is not None and not self.safety.problem:
-                    self._fresh.set()
+                self.cycle()
                 self.pace.wait()
         except BaseException as error:  # The main thread reports it.
             self.error = error

@@ -351,11 +351,14 @@ class Session:
 
     def _await_pose(self) -> None:
         """Check that a hand answers plausibly now."""
-        if self.loop.wait_fresh(1.0) is None:
+        begin = time.monotonic()
+        while (sample := self.safety.sample) is None or sample.time < begin:
             self.loop.check()
-            problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
-            silence = self.safety.alarms.refused or "the hand stopped answering; check the cable and the power"
-            raise HandError(f"{self.arguments.port}: {problem or silence}")
+            if time.monotonic() > begin + 1.0:
+                problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
+                silence = self.safety.alarms.refused or "the hand stopped answering; check the cable and the power"
+                raise HandError(f"{self.arguments.port}: {problem or silence}")
+            time.sleep(0.01)
 
     def _await_motors(self) -> None:
         until = time.monotonic() + _STILL
