@@ -71,9 +71,9 @@ BUDGETS = {
     "dexsim/calibration dexsim/identification": 1_540,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_150,  # goal: 1,900
     "dexsim_ppo": 4_100,  # goal: 4,000
-    "dexsim_real": 8_810,  # goal: 6,500
+    "dexsim_real": 8_800,  # goal: 6,500
     "benchmarks": 2_300,
-    "tests": 21_260,  # goal: 18,000
+    "tests": 21_265,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
