@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.config import Config, setting
+from dexsim_real.control.guard import Guard
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
@@ -54,8 +55,8 @@ class ExchangeLoop:
     sensing: HandSensing
     safety: Safety
     rate: float  # exchanges per second
-    beat: Callable[[float], None] = lambda more: None
-    """Called before every exchange as a sign of life, with the time s by which the next call may be late."""
+    guard: Guard | None = None
+    """Gets a sign of life before every exchange."""
     _: dataclasses.KW_ONLY
     track_taxels: bool = True
     """Follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured."""
@@ -68,7 +69,6 @@ class ExchangeLoop:
         self.command = passive_command(self.sensing.hand.num_joints)  # the newest that was sent
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
-        self._filter = VelocityFilter(self.sensing.hand.num_joints)
         self._generation: int | None = None
         self._engage = False
 
@@ -78,7 +78,7 @@ class ExchangeLoop:
 
     def cycle(self) -> HandSample | None:
         """One exchange; None without an answer. `Safety.problem` tells whether the sample is a measurement."""
-        self.beat(0.0)
+        self._beat()
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -88,7 +88,8 @@ class ExchangeLoop:
         self.command = self.sensing.command(decision.position, decision.mode, decision.stiffness)
         reply = self.port.exchange(self.command)
         if reply is None:
-            self.safety.refuse(self.port.refusal)
+            if self.port.refusal:
+                self.safety.alarms.refuse(self.port.refusal)
             return None
         self.driven = on
         self.round_trip.add(reply.received - reply.sent)
@@ -125,13 +126,17 @@ class ExchangeLoop:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._closed, seconds = True, PATIENCE if self.driven else BRIEF
-        self.beat(seconds)
+        self._beat(seconds)
         try:
             if self.port.turn_off(off, seconds):
                 self.driven = False
         finally:
             with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
                 self.port.close()
+
+    def _beat(self, more: float = 0.0) -> None:
+        if self.guard:
+            self.guard.beat(more)
 
     def _sample(self, reply: Reply) -> HandSample:
         if self.track_taxels:
@@ -141,7 +146,7 @@ class ExchangeLoop:
                 self.retared(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
         if reply.generation != self._generation:
-            self._filter.reset()
+            self._filter = VelocityFilter(self.sensing.hand.num_joints)
         self._generation = reply.generation
         velocity = self._filter.estimate(reply.received, measured.joint_position)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity, reply.state)
@@ -151,37 +156,36 @@ class LoopThread(ExchangeLoop):
     """The exchange loop in a thread, at absolute deadlines until stopped; made as `ExchangeLoop` is.
 
     The policy runs in another thread at a lower rate. If it dies, this thread continues and `Safety` reacts. Whatever
-    ends this thread, it turns the motors off.
+    ends this thread, it turns the motors off; unless the hand confirms it, the guard process does so again.
     """
 
     def __init__(self, *parts: Any, **options: Any):
         super().__init__(*parts, **options)
         self.error: BaseException | None = None
-        self._stop, self._fresh = threading.Event(), threading.Event()
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="exchange", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
+    def engage(self) -> None:
+        """Turn the motors on at the next cycle, under guard. HandError: the guard process did not start."""
+        if self.guard:
+            self.guard.arm()
+        super().engage()
+
     def check(self) -> None:
-        """Raises HandError: the thread has ended with an error."""
+        """Raises HandError: the thread has ended with an error, or the guard process does not respond."""
+        if self.guard:
+            self.guard.check()
         if self.error is not None:
             why = self.error if isinstance(self.error, HandError) else repr(self.error)
             raise HandError(f"the exchange thread failed: {why}")
-
-    def forget(self) -> None:
-        """Reset the timing statistics, to exclude the start."""
-        self.pace.jitter, self.round_trip = Timing(), Timing()
 
     def free(self, now: float) -> float:
         """The next time s at which a request has just been sent and the interpreter is idle until its answer."""
         lead, period = 0.001, self.pace.period
         return now + (self.pace.next + lead - now) % period
-
-    def wait_fresh(self, seconds: float) -> HandSample | None:
-        """Wait for the next plausible sample; None when none arrives in time."""
-        self._fresh.clear()
-        return self.safety.sample if self._fresh.wait(seconds) else None
 
     def stop(self) -> None:
         """End the thread, and turn the motors off."""
@@ -191,14 +195,15 @@ class LoopThread(ExchangeLoop):
             self._thread.join()
         else:
             self.close()
+        if self.guard:
+            self.guard.dismiss(off=not self.driven)
 
     def _run(self) -> None:
         change_priority(EXCHANGE)
         try:
             self.pace.next = self.clock() + self.pace.period
             while not self._stop.is_set():
-                if self.cycle() is not None and not self.safety.problem:
-                    self._fresh.set()
+                self.cycle()
                 self.pace.wait()
         except BaseException as error:  # The main thread reports it.
             self.error = error

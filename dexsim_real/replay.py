@@ -27,22 +27,45 @@ from dexsim.observation import Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.controller import make_observe, prepare_jax
-from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
 _KEPT = 50  # newest frames, of which a tick used one
-_OTHERS = {"calibrate": "--from-log", "identify": "--identify --from-log"}
-"""Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
 class Replay:
-    """A log that is recomputed record by record; `meta` is the configuration of the run."""
+    """A log of T ticks that is recomputed; `hand` is a TOML for where the hand is not in the place that the log names.
 
-    def __init__(self, path: Path, meta: dict[str, Any], hand: str):
-        if options := _OTHERS.get(str(meta.get("task"))):
-            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate {options} {path}` reads it")
+    Raises:
+      ConfigError: the log is of another hand.
+      LogError: not a log, or one of another command, or the log ends before the hand was ready.
+    """
+
+    def __init__(self, path: Path, hand: str = ""):
+        self.report: dict[str, Any] = {}
+        self.ticks, self.measured = list[dict[str, Any]](), list[HandMeasurement]()  # as logged; recomputed
+        self._times, self._observations = list[float](), list[np.ndarray]()
+        reader, notes = LogReader(path), list[str]()
+        with reading(path):
+            for record in reader:
+                if record.kind == Kind.META and "from" not in record.content:
+                    self._begin(path, record.content, hand)
+                elif record.kind == Kind.NOTE:
+                    notes.append(f"{record.time:.3f} {record.content}")
+                elif self.report:
+                    self._add(record)
+        if not self.report:
+            raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
+        self.time = np.array(self._times) - (self._times[0] if self._times else 0.0)  # [T] s since the first tick
+        self.observation = np.array(self._observations)  # [T, n] recomputed
+        self.report |= {"ticks": len(self.ticks), "seconds": float(self.time[-1]) if self.ticks else 0.0}
+        self.report |= {"damaged_bytes": reader.damaged, "notes": notes}
+
+    def _begin(self, path: Path, meta: dict[str, Any], hand: str) -> None:
+        """Take in the configuration of the run."""
+        if "spec" not in meta:
+            raise LogError(f"{path}: not a log of a run; `python -m dexsim_real.calibrate --from-log` reads it")
         self.hand = recorded_hand(meta.get("hand"), hand, "the log") or load_hand()
         calibration = None
         if meta["calibration"]:
@@ -54,26 +77,14 @@ class Replay:
         spec = from_dict(TaskSpec, meta["spec"])
         self.fields = layout(self.hand, spec.fields, spec.observation)
         self._observe = make_observe(calibrated_hand(self.hand, calibration), spec.fields, spec.observation)
-        self.report: dict[str, Any] = {"log": str(path)} | {name: meta[name] for name in ("task", "policy")}
+        self.report = {"log": str(path)} | {name: meta[name] for name in ("task", "policy")}
         self.report |= dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
         self.report |= {"first_difference": None, "ended": "truncated", "recorded_on": meta["environment"]}
-        self.ticks, self.measured = list[dict[str, Any]](), list[HandMeasurement]()  # as logged; recomputed
-        self._times, self._observations = list[float](), list[np.ndarray]()
         self._states: dict[int, bytes] = {}
         self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
 
-    @property
-    def time(self) -> np.ndarray:
-        """[T] s since the first tick."""
-        return np.array(self._times) - (self._times[0] if self._times else 0.0)
-
-    @property
-    def observation(self) -> np.ndarray:
-        """[T, n] recomputed."""
-        return np.array(self._observations)
-
-    def add(self, record: Record) -> None:
-        """Take in the next record."""
+    def _add(self, record: Record) -> None:
+        """Take in a later record."""
         content, report = record.content, self.report
         if record.kind == Kind.META:
             self._tares.append((content["from"], content["tare"]))
@@ -110,30 +121,6 @@ class Replay:
         self._observations.append(observation)
 
 
-def replay(path: Path, hand: str = "") -> Replay:
-    """Recompute a log; `hand` is the TOML of the hand, where it is not in the place that the log names.
-
-    Raises:
-      ConfigError: the log is of another hand.
-      LogError: not a log, or one of another command, or the log ends before the hand was ready.
-    """
-    reader, run, notes = LogReader(path), None, list[str]()
-    with reading(path):
-        for record in reader:
-            if record.kind == Kind.META and "from" not in record.content:
-                run = Replay(path, record.content, hand)
-            elif record.kind == Kind.NOTE:
-                notes.append(f"{record.time:.3f} {record.content}")
-            elif run is not None:
-                run.add(record)
-    if run is None:
-        raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
-    time = run.time
-    run.report |= {"ticks": len(time), "seconds": float(time[-1]) if len(time) else 0.0}
-    run.report |= {"damaged_bytes": reader.damaged, "notes": notes}
-    return run
-
-
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays agree to the last bit."""
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
@@ -160,10 +147,6 @@ class ReplayArguments:
     output: Path | None = None
     """JSON file for the report; None writes no file."""
 
-    def __post_init__(self):
-        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
@@ -181,7 +164,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_lerobot(arguments.lerobot)
     prepare_jax()
     cli.enable_caches()
-    run = replay(arguments.log, arguments.hand)
+    run = Replay(arguments.log, arguments.hand)
     report, ticks = run.report, len(run.ticks)
     read = f"{report['frames']} frames, {report['damaged_bytes']} damaged bytes"
     verdict = "all observations agree to the last bit" if ticks else "nothing could be compared"

@@ -27,10 +27,10 @@ from dexsim.core import cli
 from dexsim.core.config import setting
 from dexsim.hand.description import Hand
 from dexsim_real.control.controller import prepare_jax
+from dexsim_real.control.guard import Guard
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.loop import LoopOptions, LoopThread
-from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.serial_hand import open_port
 
@@ -66,9 +66,8 @@ class HandNode:
         self.sensing = HandSensing(hand, options.hardware, calibration)
         self.port = open_port(given["port"], hand, options.link)
         self.safety = Safety(hand, options.safety, node.get_logger().info)
-        self.guard = Guard(given["port"], options.link, hand) if options.guard else None
-        beat = self.guard.beat if self.guard else lambda more: None
-        self.loop = LoopThread(self.port, self.sensing, self.safety, options.rate, beat)
+        guard = Guard(given["port"], options.link, hand) if options.guard else None
+        self.loop = LoopThread(self.port, self.sensing, self.safety, options.rate, guard)
         self._shown = -1  # sequence number of the newest message
         node.create_subscription(Float64MultiArray, "~/commands", self.take_command, 1)
         self._joints = node.create_publisher(JointState, "joint_states", 10)
@@ -91,17 +90,9 @@ class HandNode:
             log(line)
         self.loop.start()
 
-    def close(self) -> None:
-        """Turn the motors off and close the port."""
-        self.loop.stop()
-        if self.guard:
-            self.guard.dismiss(off=not self.loop.driven)
-
     def switch(self, request: Any, response: Any) -> Any:
         """The service: motors on, or off for good."""
         if request.data:
-            if self.guard:
-                self.guard.arm()
             self.loop.engage()
         else:
             self.safety.relax("switched off by ~/motors")
@@ -119,8 +110,6 @@ class HandNode:
     def publish(self) -> None:
         """Publish the newest measurement, once. HandError: the exchange loop has failed."""
         self.loop.check()
-        if self.guard:
-            self.guard.check()
         sample = self.safety.sample
         if sample is None or sample.sequence == self._shown:
             return
@@ -165,7 +154,7 @@ def main(argv: Any = None) -> int:
         hand.start()
         rclpy.spin(node)
     finally:
-        hand.close()
+        hand.loop.stop()  # The motors go off.
         node.destroy_node()
         rclpy.try_shutdown()
     return 0

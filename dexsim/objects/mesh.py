@@ -23,8 +23,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 
 from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import AssetError
-from dexsim.geometry import mesh as meshes
-from dexsim.geometry import rotations, sdf
+from dexsim.geometry import mesh as meshes, rotations, sdf
 
 _ALIGNED = 0.01  # products of inertia below this share of the mean moment are none
 _VERSION = 3  # of the files in the cache

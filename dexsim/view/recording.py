@@ -44,9 +44,9 @@ def read_log(path: Path, hand: str = "") -> Episodes:
       DexsimError: the policy never ran in it.
     """
     from dexsim.geometry import rotations
-    from dexsim_real.replay import replay
+    from dexsim_real.replay import Replay
 
-    run = replay(path, hand)
+    run = Replay(path, hand)
     if not run.ticks:
         raise DexsimError(f"{path}: the log has no tick of a policy to show")
     count, measured = len(run.ticks), run.measured[: len(run.ticks)]

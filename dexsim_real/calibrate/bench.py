@@ -333,7 +333,7 @@ class Bench(ExchangeLoop):
         working = sample is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now
         if self._failing_since is not None and now - self._failing_since > _PATIENCE:
-            why = safety.refused or reason or "the hand does not answer"
+            why = safety.alarms.refused or reason or "the hand does not answer"
             raise HandError(f"stopped: {why} for {_PATIENCE:g} s")
 
     def _react(self, text: str) -> None:

@@ -80,15 +80,19 @@ class Alarms:
     def update(self, time: float, measured: HandMeasurement, command: np.ndarray | None) -> None:
         """Judge an answer at a time in s to a command [J] rad; None with the motors off."""
         self.refused, self._serious = "", max(self._serious - _FORGIVEN, 0.0)
-        sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
         waiting = (
             self._errors(time, measured),
             self._switched_off(time, measured, command is not None),
             self._deaf(time, measured, command),
         )
-        limit = self.config.alarm_seconds
-        self.fatal = next(filter(None, sudden), "") or next((text for text, lasts in waiting if lasts > limit), "")
-        self.hold = next((text for text, lasts in waiting if text), "")
+        findings = (
+            (*self._heat(time, measured), 0.0),
+            (*self._overcurrent(time, measured), self.config.current_seconds),
+            (*self._stall(time, measured), self.config.stall_seconds),
+            *((*finding, self.config.alarm_seconds) for finding in waiting),
+        )
+        self.fatal = next((text for text, lasts, limit in findings if lasts > limit), "")
+        self.hold = next((text for text, _ in waiting if text), "")
 
     def refuse(self, refusal: Refusal) -> None:
         """Judge an answer in which the hand refuses the command."""
@@ -97,32 +101,27 @@ class Alarms:
         if self._serious >= 2:
             self.fatal = refusal.text
 
-    # --- findings -------------------------------------------------------------------------------
+    # --- findings, each with the seconds for which it has lasted; negative without one --------------------
 
-    def _heat(self, time: float, measured: HandMeasurement) -> str:
+    def _heat(self, time: float, measured: HandMeasurement) -> tuple[str, np.ndarray]:
         hottest = int(measured.temperature.argmax())
         degrees = measured.temperature[hottest]
-        if self._hot.update(time, degrees > self.config.temperature) <= 0:
-            return ""
-        return f"too hot: {self._parts[hottest]}, {degrees:.0f} degC"
+        lasts = self._hot.update(time, degrees > self.config.temperature)
+        return f"too hot: {self._parts[hottest]}, {degrees:.0f} degC", lasts
 
-    def _overcurrent(self, time: float, measured: HandMeasurement) -> str:
+    def _overcurrent(self, time: float, measured: HandMeasurement) -> tuple[str, np.ndarray]:
         joint = int(measured.current.argmax())
         lasts = self._current.update(time, measured.current[joint] > self.config.current)
-        if lasts <= self.config.current_seconds:
-            return ""
-        return f"current too high: {measured.current[joint]:.2f} A in {self._joints[joint]}"
+        return f"current too high: {measured.current[joint]:.2f} A in {self._joints[joint]}", lasts
 
-    def _stall(self, time: float, measured: HandMeasurement) -> str:
+    def _stall(self, time: float, measured: HandMeasurement) -> tuple[str, np.ndarray]:
         position = measured.joint_position
         # A current that is not measured (NaN) is above nothing.
         still = (measured.current > self.config.stall_current) & (np.abs(position - self._stood) <= _STILL)
         lasts = self._stalled.update(time, still)
         self._stood = np.where(self._stalled.seconds > 0, self._stood, position)
         joint = int(lasts.argmax())
-        if lasts[joint] <= self.config.stall_seconds:
-            return ""
-        return f"stalled: {self._joints[joint]} draws {measured.current[joint]:.2f} A without moving"
+        return f"stalled: {self._joints[joint]} draws {measured.current[joint]:.2f} A without moving", lasts[joint]
 
     def _errors(self, time: float, measured: HandMeasurement) -> tuple[str, np.ndarray]:
         bits = measured.errors & ~self._harmless

@@ -22,9 +22,6 @@ from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.sensors.imu import IDENTITY
 
-SOURCES = ("hand", "camera", "imu", "user", "policy")
-"""Who gives the bridge what a policy observes; see `ObservationField.source`."""
-
 NEEDS = {
     "joint_torque": ("currents",),
     "contact_force": ("taxels",),
@@ -64,7 +61,7 @@ def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) 
 def sources_of(names: Sequence[str]) -> set[str]:
     """The sensors ("hand", "camera", "imu", ...) for these observation fields. HandError: none measures one of them."""
     for name in names:
-        if name not in FIELDS or FIELDS[name].source not in SOURCES:
+        if name not in FIELDS or FIELDS[name].source == "simulator":
             raise HandError(f"the policy observes {name!r:.80}, which no sensor measures on hardware")
     return {FIELDS[name].source for name in names}
 
@@ -130,12 +127,7 @@ class Controller:
 
     def resume(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad after a hold, perhaps with the object put back: the past is forgotten."""
-        self.anchor(position)
-        self.carry = self.policy.initial_carry()
-
-    def anchor(self, position: np.ndarray) -> None:
-        """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
-        self.target = np.asarray(position, np.float32)
+        self.target, self.carry = np.asarray(position, np.float32), self.policy.initial_carry()
 
     def tick(self, measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Readings, observation, action and joint targets; `goal_quat` [4] of the object, grip command in [0, 1]."""

@@ -124,7 +124,7 @@ class PolicyLoop:
             self._anchor = safety.anchor
             self.controller.resume(safety.commanded)
         if self.motors_off:
-            self.controller.anchor(sample.measured.joint_position)
+            self.controller.target = sample.measured.joint_position  # Somebody may have moved the hand.
         estimate, when = self.objects.read(now)
         goal = self.goals.update(when, estimate) if self.goals else IDENTITY
         tick = self.controller.tick(sample.measured, estimate, goal, self.command)

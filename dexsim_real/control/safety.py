@@ -25,7 +25,6 @@ from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import Refusal
 
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
 _FORCE = "the fingertip force is too high"
@@ -81,8 +80,8 @@ class TargetRequest(NamedTuple):
 class Safety:
     """Decides which command is sent.
 
-    Not thread-safe: one thread calls `decide`, `update` and `engage`. Another may call `set_target`, which replaces one
-    tuple. `note` is called with one line whenever the reaction or its reason changes.
+    Not thread-safe: one thread calls `decide`, `update`, `engage` and `alarms.refuse`. Another may call `set_target`,
+    which replaces one tuple. `note` is called with one line whenever the reaction or its reason changes.
     """
 
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
@@ -103,7 +102,7 @@ class Safety:
         self.counts: Counter[str] = Counter()  # cycles by reason
         self._target: TargetRequest | None = None
         self._pose = PoseCheck(hand)
-        self._alarms = Alarms(hand, config)
+        self.alarms = Alarms(hand, config)
         self._joints = joint_labels(hand)
         self._generation: int | None = None
         self._wrong = Lasting()  # measurements that were wrong
@@ -120,11 +119,6 @@ class Safety:
     def commanded(self) -> np.ndarray:
         """Where commands continue [J] rad: the last one, or the measured pose with the motors off."""
         return self._rest() if self._commanded is None else self._commanded
-
-    @property
-    def refused(self) -> str:
-        """What the hand said when it refused a command, until it answers one again."""
-        return self._alarms.refused
 
     def update(self, sample: HandSample) -> bool:
         """Update with a measurement; returns whether it is plausible. Otherwise it does not count as one."""
@@ -144,13 +138,8 @@ class Safety:
             return False
         self.sample = sample
         self._wrong.update(sample.time, False)
-        self._alarms.update(sample.time, measured, self._commanded)
+        self.alarms.update(sample.time, measured, self._commanded)
         return True
-
-    def refuse(self, refusal: Refusal | None) -> None:
-        """Update with an exchange that brought no state; None if the hand has not refused the command."""
-        if refusal is not None:
-            self._alarms.refuse(refusal)
 
     def set_target(self, position: np.ndarray, time: float, hold_reason: str = "") -> None:
         """Request joint targets [J] rad at a time in s.
@@ -173,7 +162,7 @@ class Safety:
         """The command for this cycle."""
         if not self.engaged or self.latched or self.sample is None:
             return self._finish(now, Reaction.RELAX, self.latched or "not engaged", self._rest())
-        sample, fatal = self.sample, self._alarms.fatal
+        sample, fatal = self.sample, self.alarms.fatal
         if self.problem and self._wrong.seconds > self.config.patience:
             fatal = f"implausible measurements for {self.config.patience:g} s: {self.problem}"
         if fatal:
@@ -182,8 +171,8 @@ class Safety:
         if self._commanded is None:
             silent = now - sample.time > self.config.stale  # The hand may have been moved since.
             pose = self._pose.at_rest
-            if silent or self.problem or self._alarms.hold or pose is None:
-                why = self.problem or (self._silence() if silent else self._alarms.hold or UNKNOWN)
+            if silent or self.problem or self.alarms.hold or pose is None:
+                why = self.problem or (self._silence() if silent else self.alarms.hold or UNKNOWN)
                 return self._finish(now, Reaction.RELAX, why, self._rest())
             self._start(now, pose)
         request = self._target  # Read once: another thread may replace it meanwhile.
@@ -203,7 +192,7 @@ class Safety:
         return self._follow(now, sample, self.commanded if request is None else request.position)
 
     def _silence(self) -> str:
-        return f"{_SILENT}: {self.refused}" if self.refused else _SILENT
+        return f"{_SILENT}: {self.alarms.refused}" if self.alarms.refused else _SILENT
 
     def _lasted(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
         """What has lasted for longer than `patience`, whatever else the hand held for meanwhile; empty for nothing."""
@@ -220,8 +209,8 @@ class Safety:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
             return self._silence()
-        if self._alarms.hold:
-            return self._alarms.hold
+        if self.alarms.hold:
+            return self.alarms.hold
         speed = np.abs(sample.velocity)
         if np.any(speed > config.joint_speed):
             return f"too fast: {self._joints[int(speed.argmax())]}"

@@ -24,6 +24,7 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim_real.core.process import BACKGROUND, change_priority
+from dexsim_real.core.stream import FrameParser
 
 MAGIC = b"DXSLOG2\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
@@ -31,7 +32,7 @@ _HEAD = struct.Struct("<4sII")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
-_CHECKED = 4  # checksums over one byte of a log, on average; 1 without damage
+_CHUNK = 1 << 20  # bytes that are searched at once
 _LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
 
 
@@ -59,7 +60,7 @@ class Record:
     content: Any  # dict with NumPy arrays, text, or (number, frame), by `kind`
 
 
-class LogWriter:
+class LogWriter(contextlib.AbstractContextManager):
     """Accepts records from any thread without blocking. A context manager.
 
     A full disk ends the log, not the run: `failure` has the reason and `dropped` counts the lost records.
@@ -88,9 +89,6 @@ class LogWriter:
         if not (self.dropped or self.failure):
             return ""
         return f"{self.dropped} log records are lost ({self.failure or 'the disk is too slow'})"
-
-    def __enter__(self) -> "LogWriter":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -145,9 +143,9 @@ def encode(kind: Kind, when: float, content: Any) -> bytes:
 
 
 class LogReader:
-    """Iterates over the intact records of a log; `damaged` counts the bytes skipped so far.
+    """Iterates over the intact records of a log; `damaged` counts the other bytes, at the end.
 
-    Raises LogError: the file is missing, is not a log, or has more false heads than damage explains.
+    Raises LogError: the file is missing or is not a log.
     """
 
     def __init__(self, path: str | Path):
@@ -160,21 +158,13 @@ class LogReader:
             raise LogError(f"{self.path}: this is not a log of `dexsim_real`; give a .log file of a run")
 
     def __iter__(self) -> Iterator[Record]:
-        at, data, self.damaged = len(MAGIC), self._data, 0
-        # A false head costs a checksum over all that it claims: without a bound a forged file would cost its square.
-        left = _CHECKED * len(data) + _LONGEST
-        while at < len(data):
-            record, end = _decode(data, at)
-            left -= end - at
-            if left < 0:
-                raise LogError(f"{self.path}: nearly all of it is damaged; record again")
-            if record is not None:
+        parser = FrameParser(SYNC, _HEAD.size, _size, _decode)
+        self.damaged = len(self._data) - len(MAGIC)
+        for begin in range(len(MAGIC), len(self._data), _CHUNK):
+            chunk = self._data[begin : begin + _CHUNK]
+            for size, record in parser.feed(chunk, final=begin + _CHUNK >= len(self._data)):
+                self.damaged -= size
                 yield record
-            else:  # Go on at what looks like the next record.
-                end = data.find(SYNC, at + 1)
-                end = len(data) if end < 0 else end
-                self.damaged += end - at
-            at = end
 
 
 @contextlib.contextmanager
@@ -191,19 +181,18 @@ def reading(path: str | Path) -> Iterator[None]:
         raise LogError(f"{path}: invalid record ({type(error).__name__}: {error}); record again") from error
 
 
-def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
-    """The record at a place, None where there is no intact one; and the end of what was read for it."""
-    if at + _HEAD.size > len(data):
-        return None, at
-    sync, length, checksum = _HEAD.unpack_from(data, at)
-    end = at + _HEAD.size + length
-    payload = data[at + _HEAD.size : end]
-    if sync != SYNC or length > _LONGEST or len(payload) < length:
-        return None, at
-    if zlib.crc32(payload) != checksum:
-        return None, end
+def _size(head: bytes) -> int:
+    size = _HEAD.unpack(head)[1]
+    return _HEAD.size + size if size <= _LONGEST else 0
+
+
+def _decode(data: bytes) -> tuple[int, Record] | None:
+    """Size and content of a record; None of a damaged one."""
+    payload = data[_HEAD.size :]
+    if zlib.crc32(payload) != _HEAD.unpack_from(data)[2]:
+        return None
     kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-    return Record(Kind(kind), when, content), end
+    return len(data), Record(Kind(kind), when, content)
 
 
 def _pack_array(value: Any) -> Any:

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import gc
 import hashlib
-import math
 import sys
 import termios
 import time
@@ -17,6 +16,7 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
+from rich.table import Table
 
 from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
@@ -25,14 +25,14 @@ from dexsim.core.config import setting, to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, Tick, prepare_jax
+from dexsim_real.control.guard import Guard
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
-from dexsim_real.loop import LoopOptions, LoopThread, Pace, keep_phase
-from dexsim_real.run.guard import Guard
-from dexsim_real.run.status import HandState, StatusView
+from dexsim_real.loop import LoopOptions, LoopThread, Pace, Timing, keep_phase
+from dexsim_real.run.status import StatusView, hand_tables
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import UPRIGHT_X, Imu
@@ -100,8 +100,6 @@ class RunArguments(LoopOptions):
 
     def __post_init__(self):
         super().__post_init__()
-        if math.hypot(*self.imu_mount) < 1e-3:
-            raise HandError(f"--imu-mount {' '.join(f'{v:g}' for v in self.imu_mount)}: is no orientation (w, x, y, z)")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")
 
@@ -183,33 +181,30 @@ def execute(arguments: RunArguments) -> RunResult:
 class Outcome:
     """Whether a run did what it was started for: a hand that was gone or held, or lost records, are no success."""
 
-    def __init__(self, began: float = 0.0):
-        self._began = self._last = began
-        self._blind = self._held = 0.0  # s
-        self._actions = self._wrong = 0
+    def __init__(self) -> None:
+        self._ticks = self._blind = self._held = self._wrong = 0
         self._reason = self._silence = ""  # of the newest hold, and of the newest refusal
 
-    def add(self, now: float, target: np.ndarray | None, safety: Safety) -> None:
-        """Count the time up to `now` s; `target` [J] is the policy's, None when no measurement was young enough."""
-        step, self._last = now - self._last, now
+    def add(self, target: np.ndarray | None, safety: Safety) -> None:
+        """Count a tick; `target` [J] is the policy's, None when no measurement was young enough."""
+        self._ticks += 1
         if target is None:
-            self._blind += step
-            self._silence = safety.refused or self._silence
+            self._blind += 1
+            self._silence = safety.alarms.refused or self._silence
         else:
-            self._actions += 1
             self._wrong += not np.isfinite(target).all()
         reaction, reason = safety.last
         if safety.engaged and reaction >= Reaction.HOLD:
-            self._held += step
+            self._held += 1
             self._reason = reason
 
     def missing(self, log: LogWriter) -> list[str]:
         """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
-        total = max(self._last - self._began, 1e-9)
-        blind, held, why = self._blind / total, self._held / total, f" ({self._silence})" if self._silence else ""
+        total, why = max(self._ticks, 1), f" ({self._silence})" if self._silence else ""
+        blind, held, actions = self._blind / total, self._held / total, self._ticks - self._blind
         lines = {
             f"no measurement for {100 * blind:.0f} % of the run{why}": blind > _BLIND,
-            f"{self._wrong} of {self._actions} actions of the policy were not finite": self._wrong,
+            f"{self._wrong} of {actions} actions of the policy were not finite": self._wrong,
             f"the hand was held for {100 * held:.0f} % of the run, last because: {self._reason}": held > _HELD,
             log.losses: log.losses,
         }
@@ -227,7 +222,7 @@ class Session:
         guarded = arguments.guard and not arguments.motors_off
         policy = load_policy(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
-        self.guard = Guard(arguments.port, arguments.link, hand) if guarded else None
+        guard = Guard(arguments.port, arguments.link, hand) if guarded else None
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.port = open_port(arguments.port, hand, arguments.link, self._tap)
         self.controller = Controller(policy, calibrated_hand(hand, calibration))
@@ -240,10 +235,9 @@ class Session:
         realtime = arguments.realtime and use_realtime()
         self.log = LogWriter(arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log"))
         rate = keep_phase(arguments.rate, policy.control_rate)
-        beat = self.guard.beat if self.guard else lambda more: None
-        self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
+        self.loop = LoopThread(self.port, self.sensing, self.safety, rate, guard)
         self.loop.retared = self._retare
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self.hand_state, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self._hand_tables, arguments.quiet)
         self.policy: PolicyLoop | None = None  # from `prepare` on
         self.pace = Pace(policy.control_rate)
         self.started = 0.0
@@ -290,8 +284,6 @@ class Session:
         gc.collect()
         gc.freeze()
         with self.view:
-            if self.guard:
-                self.guard.arm()
             if not self.arguments.motors_off:
                 self.loop.engage()
                 self._await_motors()
@@ -311,8 +303,6 @@ class Session:
             return
         self.end = reason or self.end
         self.loop.stop()
-        if self.guard:
-            self.guard.dismiss(off=not self.loop.driven)
         if self.loop.driven:
             self.end += f"; {UNCONFIRMED}: press the emergency stop"
         if self.policy:
@@ -351,21 +341,24 @@ class Session:
             summary |= {"successes": policy.goals.successes, "success_times": times}
         return summary
 
-    def hand_state(self) -> HandState | None:
-        """What the view shows of the hand; None without a measurement. Called from the view's thread."""
+    def _hand_tables(self) -> Table | str:
+        """What the view shows of the hand; empty without a measurement. Called from the view's thread."""
         sample, sent = self.safety.sample, self.safety.last[0] != Reaction.RELAX
         if sample is None:
-            return None
+            return ""
         target = self.safety.commanded if sent else self.newest.target if self.newest else None
-        return HandState(self.sensing.hand, sample.measured, target, sent)
+        return hand_tables(self.sensing.hand, sample.measured, target, sent)
 
     def _await_pose(self) -> None:
         """Check that a hand answers plausibly now."""
-        if self.loop.wait_fresh(1.0) is None:
+        begin = time.monotonic()
+        while (sample := self.safety.sample) is None or sample.time < begin:
             self.loop.check()
-            problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
-            silence = self.safety.refused or "the hand stopped answering; check the cable and the power"
-            raise HandError(f"{self.arguments.port}: {problem or silence}")
+            if time.monotonic() > begin + 1.0:
+                problem = self.safety.problem and f"{self.safety.problem}; check `--hardware.joint-offset`"
+                silence = self.safety.alarms.refused or "the hand stopped answering; check the cable and the power"
+                raise HandError(f"{self.arguments.port}: {problem or silence}")
+            time.sleep(0.01)
 
     def _await_motors(self) -> None:
         until = time.monotonic() + _STILL
@@ -376,8 +369,6 @@ class Session:
             time.sleep(0.01)
 
     def _check(self) -> None:
-        if self.guard:
-            self.guard.check()
         self.loop.check()
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
@@ -385,15 +376,14 @@ class Session:
     def _run_policy(self, policy: PolicyLoop) -> None:
         """Tick until the time is over."""
         self.started = time.monotonic()
-        self.outcome = Outcome(self.started)
-        self.loop.forget()
+        self.loop.pace.jitter, self.loop.round_trip = Timing(), Timing()  # without those of the start
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
         self.pace.next = self.loop.free(self.pace.next)
         while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
             tick = policy.tick(now)
-            self.outcome.add(now, tick.target if tick else None, self.safety)
+            self.outcome.add(tick.target if tick else None, self.safety)
             if tick is not None:
                 self.newest = tick
                 fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}

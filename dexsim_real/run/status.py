@@ -5,7 +5,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple, TextIO, cast
+from typing import Any, TextIO, cast
 
 import numpy as np
 from rich import box
@@ -19,15 +19,6 @@ from dexsim_real.core.process import BACKGROUND, change_priority
 from dexsim_real.sensors.hand import HandMeasurement
 
 _LIVE = 0.25  # s between two updates of the tables
-
-
-class HandState(NamedTuple):
-    """What the view shows of the hand."""
-
-    hand: Hand
-    measured: HandMeasurement
-    target: np.ndarray | None  # [J] rad, the newest joint targets; None before the first
-    sent: bool  # whether the motors follow them
 
 
 class _Lasting:
@@ -56,7 +47,7 @@ class StatusView:
         self,
         title: str,
         summary: Callable[[], dict[str, Any]],
-        hand: Callable[[], HandState | None],
+        hand: Callable[[], Table | str],
         quiet: bool = False,
     ):
         self.console = _console(quiet)
@@ -103,8 +94,7 @@ class StatusView:
         self._print_notes()
 
     def _tables(self) -> Group:
-        state = self._hand()
-        return Group(*([_hand_tables(state)] if state else []), "", _rows(self._title, self._summary()))
+        return Group(self._hand(), "", _rows(self._title, self._summary()))
 
 
 def show_summary(title: str, summary: dict[str, Any]) -> None:
@@ -133,17 +123,19 @@ def _rows(title: str, summary: dict[str, Any]) -> Table:
     return table
 
 
-def _hand_tables(state: HandState) -> Table:
-    """Joints on the left, with the error registers of their boards; fingertips on the right."""
-    hand, measured = state.hand, state.measured
+def hand_tables(hand: Hand, measured: HandMeasurement, target: np.ndarray | None, sent: bool) -> Table:
+    """Joints on the left, with the error registers of their boards; fingertips on the right.
+
+    `target` [J] rad are the newest joint targets, None before the first; `sent` tells whether the motors follow them.
+    """
     heat, force = measured.temperature, measured.finger_force
-    target = "target" if state.sent else "(not sent)"
-    joints = _table("joint (rad)", "measured", target, "A", "degC", "errors: palm", "joint", "tip")
+    title = "target" if sent else "(not sent)"
+    joints = _table("joint (rad)", "measured", title, "A", "degC", "errors: palm", "joint", "tip")
     for joint, name in enumerate(hand.joint_names):
         joints.add_row(
             f"{joint:2d} {name}",
             f"{measured.joint_position[joint]:.3f}",
-            "-" if state.target is None else f"{state.target[joint]:.3f}",
+            "-" if target is None else f"{target[joint]:.3f}",
             "-" if np.isnan(measured.current[joint]) else f"{measured.current[joint]:.2f}",
             f"{heat[joint]:.0f}",
             *(f"{bits:04x}" if bits else "-" for bits in measured.errors[joint]),

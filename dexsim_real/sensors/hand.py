@@ -217,13 +217,8 @@ class VelocityFilter:
     """Joint velocities [J] rad/s: differences of the joint angles through a first-order filter."""
 
     def __init__(self, joints: int):
-        self._joints = joints
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all measurements."""
         self._last: tuple[float, np.ndarray] | None = None
-        self.velocity = np.zeros(self._joints, np.float32)
+        self.velocity = np.zeros(joints, np.float32)
 
     def estimate(self, time: float, position: np.ndarray) -> np.ndarray:
         """Velocities [J] rad/s if this measurement [J] rad at a time in s were kept."""

@@ -12,6 +12,7 @@ import struct
 import threading
 import time
 
+import mujoco
 import numpy as np
 
 from dexsim_real.core.errors import HandError, open_serial
@@ -51,16 +52,9 @@ def decode(frame: bytes) -> np.ndarray | None:
     _, yaw, pitch, roll, *_ = _BODY.unpack(body)
     if abs(yaw) > 18000 or abs(pitch) > 9000 or abs(roll) > 18000:
         return None
-    half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
-    (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    quat = np.zeros(4)
+    mujoco.mju_euler2Quat(quat, np.radians([yaw, pitch, roll]) / 100, "zyx")
+    return quat
 
 
 def make_parser() -> FrameParser[tuple[int, np.ndarray]]:
@@ -89,11 +83,11 @@ class ImuReader:
     A frame that repeats the index of the last one is no new sample: an IMU that hangs is silent. A sample farther from
     the last sound one than an object turns between two samples is left out; when the next ones are, too, `jumped` is
     true until they come back.
-    `mount` [4] is the orientation of the IMU in the object, `port` its name for messages.
+    `mount` [4] is the orientation of the IMU in the object.
     """
 
-    def __init__(self, mount: tuple[float, ...] = UPRIGHT_X, port: str = "IMU"):
-        self.port, self.parser = port, make_parser()
+    def __init__(self, mount: tuple[float, ...] = UPRIGHT_X):
+        self.parser = make_parser()
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
@@ -126,8 +120,7 @@ class ImuReader:
 
     def read(self) -> tuple[float, np.ndarray]:
         """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
-        if self._newest is None or self._world is None:
-            raise HandError(f"{self.port}: the IMU has not been aligned; call `calibrate` first")
+        assert self._newest is not None and self._world is not None, "`calibrate` first"
         when, quat = self._newest
         return when, multiply(multiply(self._world, quat), conjugate(self._mount))
 
@@ -145,8 +138,8 @@ class Imu(ImuReader):
     """Reads the IMU at a serial port from its own thread. HandError: the port cannot be opened."""
 
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
-        super().__init__(mount, port)
-        self._stop = threading.Event()
+        super().__init__(mount)
+        self.port, self._stop = port, threading.Event()
         self._serial = open_serial(port, BAUD, timeout=0.05)
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()

@@ -13,7 +13,7 @@ import numpy as np
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire.frames import HOST, Command, Frame, Mode, driver_block, palm_address, passive_command
-from dexsim_real.wire.link import LinkConfig, ReconnectingPort, Refusal, Reply
+from dexsim_real.wire.link import HandPort, LinkConfig, Refusal, Reply
 
 NEWTONS_PER_COUNT = 0.1  # of the blocks' taxel counts; the default of `--hardware.force-per-count`
 WITHOUT = {
@@ -81,8 +81,8 @@ class HandDriver(Protocol):
         ...
 
 
-class DriverPort(ReconnectingPort):
-    """`HandPort` of a hand that has a driver; `options` are those of `ReconnectingPort`.
+class DriverPort(HandPort):
+    """`HandPort` of a hand that has a driver; `options` are those of `HandPort`.
 
     `hand` gives the number of joints, fingers and taxels.
     """
@@ -114,10 +114,7 @@ class DriverPort(ReconnectingPort):
         self.driver.close()
 
     def _reopen(self) -> None:
-        try:
-            self.connect()
-        except HandError as error:
-            raise OSError from error
+        self.connect()
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1

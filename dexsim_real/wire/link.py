@@ -185,12 +185,28 @@ def printable(content: bytes) -> str:
     return text if text.isprintable() and text.isascii() else ""
 
 
+@dataclasses.dataclass(eq=False)
 class HandPort:
-    """The interface of a hand. `exchange` is called from one thread only."""
+    """A hand on a line that is opened again when it fails, after waits that double at each attempt.
 
-    counts: LinkCounts
-    identity = Identity()  # what the hand tells about itself
-    refusal: Refusal | None = None  # why the newest exchange was refused
+    `exchange` is called from one thread only.
+    """
+
+    config: LinkConfig  # its `backoff` counts
+    passive: np.ndarray  # turns the motors off; until its answer no other command is sent on a line that is new
+    _: dataclasses.KW_ONLY
+    tap: Callable[[str, bytes], None] | None = None
+    """Called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`."""
+    clock: Callable[[], float] | None = None  # s, in which replies are stamped; that of the exchange loop
+    identity: Identity = dataclasses.field(default=Identity(), init=False)  # what the hand tells about itself
+    refusal: Refusal | None = dataclasses.field(default=None, init=False)  # why the newest exchange was refused
+
+    def __post_init__(self) -> None:
+        self.counts = LinkCounts()
+        self._tap = self.tap or (lambda direction, data: None)
+        self._clock, self._sleep = self.clock or time.monotonic, time.sleep
+        self._connected, self._returning, self._generation = False, False, 0
+        self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
     @property
     def missing(self) -> list[str]:
@@ -220,7 +236,26 @@ class HandPort:
         runner that does not move for dead. After a reconnection the given command is not sent: the first reply of a new
         generation comes from a passive hand. A passive command is answered only once the motors are off.
         """
-        raise NotImplementedError
+        self.refusal = None
+        try:
+            if not self._connected:
+                if self._clock() < self._retry_at:
+                    self._sleep(_PAUSE)
+                    return None
+                try:
+                    self._reopen()
+                except HandError as error:
+                    raise OSError from error
+                self.counts.reconnects += 1
+                self._returning, self._pause = True, self.config.backoff[0]
+            reply = self._exchange(self.passive if self._returning else command)
+        except OSError:  # Base class of pyserial's errors.
+            self.close()
+            self._retry_at = self._clock() + self._pause
+            self._pause = min(2 * self._pause, self.config.backoff[1])
+            return None
+        self._returning &= reply is None
+        return reply
 
     def close(self) -> None:
         """Close the port, motors as they are; no error where it is closed already."""
@@ -239,48 +274,10 @@ class HandPort:
             if time.monotonic() > until:
                 return False
 
-
-@dataclasses.dataclass(eq=False)
-class ReconnectingPort(HandPort):
-    """What ports have in common: a line that fails is opened again, after waits that double at each attempt."""
-
-    config: LinkConfig  # its `backoff` counts
-    passive: np.ndarray  # turns the motors off; until its answer no other command is sent on a line that is new
-    _: dataclasses.KW_ONLY
-    tap: Callable[[str, bytes], None] | None = None
-    """Called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`."""
-    clock: Callable[[], float] | None = None  # s, in which replies are stamped; that of the exchange loop
-
-    def __post_init__(self) -> None:
-        self.counts = LinkCounts()
-        self._tap = self.tap or (lambda direction, data: None)
-        self._clock, self._sleep = self.clock or time.monotonic, time.sleep
-        self._connected, self._returning, self._generation = False, False, 0
-        self._retry_at, self._pause = 0.0, self.config.backoff[0]
-
-    def exchange(self, command: np.ndarray) -> Reply | None:
-        self.refusal = None
-        try:
-            if not self._connected:
-                if self._clock() < self._retry_at:
-                    self._sleep(_PAUSE)
-                    return None
-                self._reopen()
-                self.counts.reconnects += 1
-                self._returning, self._pause = True, self.config.backoff[0]
-            reply = self._exchange(self.passive if self._returning else command)
-        except OSError:  # Base class of pyserial's errors.
-            self.close()
-            self._retry_at = self._clock() + self._pause
-            self._pause = min(2 * self._pause, self.config.backoff[1])
-            return None
-        self._returning &= reply is None
-        return reply
-
     def _exchange(self, command: np.ndarray) -> Reply | None:
         """One exchange on an open line. OSError: the line failed."""
         raise NotImplementedError
 
     def _reopen(self) -> None:
-        """Open the line to the hand that was there before. OSError: it is still gone."""
+        """Open the line to the hand that was there before. OSError or HandError: it is still gone."""
         raise NotImplementedError

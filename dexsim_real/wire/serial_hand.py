@@ -17,7 +17,7 @@ from dexsim_real.core.errors import HandError, find_function, open_serial
 from dexsim_real.wire import frames, link
 from dexsim_real.wire.driver import DriverPort
 from dexsim_real.wire.frames import Command, Frame, passive_command
-from dexsim_real.wire.link import HandPort, Identity, LinkConfig, ReconnectingPort, Refusal, Reply
+from dexsim_real.wire.link import HandPort, Identity, LinkConfig, Refusal, Reply
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -28,11 +28,11 @@ _REGISTER = 34  # bytes of the answer: number and content
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
 
-class SerialHand(ReconnectingPort):
+class SerialHand(HandPort):
     """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
     `identity` is what the hand told about itself when it was connected. Another hand on the port is refused: it is told
-    to turn its motors off, and nothing else. `options` are those of `ReconnectingPort`.
+    to turn its motors off, and nothing else. `options` are those of `HandPort`.
     """
 
     def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
@@ -41,8 +41,6 @@ class SerialHand(ReconnectingPort):
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
-        self._others = self._early = 0  # frames of other hands; answers that came sooner than the baud rate allows
-        self._owed = False  # whether the last request has not been answered yet
 
     def connect(self) -> str:
         """Open the port and identify the hand; see `HandPort.connect`."""
@@ -135,9 +133,7 @@ class SerialHand(ReconnectingPort):
                     answer = frame
                 else:  # It answers an earlier request.
                     self.counts.late += 1
-                    self._early += not (possible or self._owed)
                     self._received -= size
-        self._owed = answer is None and not self._early
         return answer
 
     def _read(self) -> bytes:
@@ -161,9 +157,7 @@ class SerialHand(ReconnectingPort):
         Other addresses pass: no capture of a real hand's replies is published.
         """
         own = frames.palm_address(self.config.hand_id)
-        mine = [frame for frame in answers if frame.source == own or frame.source not in frames.PALMS]
-        self._others += len(answers) - len(mine)
-        return mine
+        return [frame for frame in answers if frame.source == own or frame.source not in frames.PALMS]
 
     # --- opening and reopening --------------------------------------------------------------
 
@@ -208,27 +202,21 @@ class SerialHand(ReconnectingPort):
         config, counts = self.config, self.counts
         if not self._received and not counts.late:
             why = f"no answer; check the power, the A and B wires of RS485, and --link.hand-id (now {config.hand_id})"
-        elif self._early:
-            why = f"answers arrive sooner than {config.baud} baud allow; use --link.no-paced for an emulated line"
         elif counts.late:
             why = f"answers come too late; raise --link.margin (now {config.margin:g} s), or check the latency timer"
-        elif self._others:
-            why = f"frames come, but from no hand with the id {config.hand_id}; check --link.hand-id and the line"
+            why += "; an emulated line without the timing of the wire needs --link.no-paced"
         elif self.refusal is not None:
             why = f"{self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
         elif not self._parser.frames and not self._parser.damaged:
             why = f"no bytes belong to a frame; set --link.baud to that of the hand (now {config.baud} baud)"
         else:
             what = f"{counts.crc_errors} wrong checksums, {counts.refused} refusals"
-            why = f"the hand answers without a valid state ({what}); check cable and termination"
+            why = f"no valid state ({what}); check cable, termination and --link.hand-id (now {config.hand_id})"
         return f"{self.port}: {why}"
 
     def _reopen(self) -> None:
-        try:
-            self._open()
-            self._handshake(0.0)
-        except HandError as error:
-            raise OSError from error
+        self._open()
+        self._handshake(0.0)
         if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
             text = f"another hand is on {self.port}: {identity}, not {self.identity}"
             self.refusal = Refusal(text, serious=True)

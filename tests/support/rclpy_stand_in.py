@@ -3,6 +3,7 @@
 Messages have the fields of the ROS definitions, and take no others.
 """
 
+import dataclasses
 import sys
 import types
 from types import SimpleNamespace
@@ -10,19 +11,8 @@ from types import SimpleNamespace
 
 def message(name, /, **fields):
     """A class of messages: fields with the makers of their first values; unknown ones are an error, as in ROS."""
-
-    def __init__(self, **given):
-        for field, first in fields.items():
-            object.__setattr__(self, field, first())
-        for field, value in given.items():
-            setattr(self, field, value)
-
-    def __setattr__(self, field, value):
-        if field not in fields:
-            raise AttributeError(f"{name} has no field {field}")
-        object.__setattr__(self, field, value)
-
-    return type(name, (), {"__init__": __init__, "__setattr__": __setattr__})
+    made = [(field, object, dataclasses.field(default_factory=first)) for field, first in fields.items()]
+    return dataclasses.make_dataclass(name, made, slots=True)
 
 
 Header = message("Header", stamp=lambda: None, frame_id=str)

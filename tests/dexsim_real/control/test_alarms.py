@@ -8,14 +8,10 @@ from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import Reaction, Safety
-from dexsim_real.loop import ExchangeLoop
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire import frames
+from dexsim_real.control.safety import Reaction
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import LinkCounts, Refusal, Reply, read_refusal
+from dexsim_real.wire.link import read_refusal
 
-FINGER = ["thumb"] * 3 + ["index"] * 3 + ["middle"] * 2 + ["ring"] * 2 + ["pinky"] * 2
 ON = np.full(12, Mode.POSITION, np.uint8)
 JOINTS = np.arange(12)
 
@@ -108,9 +104,9 @@ def test_an_error_bit_holds_then_turns_the_motors_off_by_its_name(bench, joint, 
     for _ in range(3):
         decision = cycle(bench, errors=errors)
     assert decision.mode == Mode.PASSIVE and bench.safety.latched == decision.reason
-    name = ("palm", "joint", "tip")[board]
+    name, finger = ("palm", "joint", "tip")[board], {0: "thumb", 11: "pinky"}[joint]
     assert f"error bits 0x{1 << bit:04x} of the {name} board, joint" in decision.reason
-    assert f"({FINGER[joint]})" in decision.reason
+    assert f"({finger})" in decision.reason
 
 
 def test_error_bits_that_are_known_to_be_harmless_are_ignored(hand):
@@ -179,22 +175,9 @@ def test_a_joint_that_moves_at_high_current_or_rests_at_a_low_one_is_not_stalled
 # --- angles that do not follow ---------------------------------------------------------------------
 
 
-def wave(bench, size=0.5):
+def wave(bench):
     """Targets of a policy that moves each finger in its own way."""
-    return (MIDDLE + size * FREE * np.sin(bench.now + JOINTS)).astype(np.float32)
-
-
-def until_off(bench, read, seconds=10.0, **fields):
-    """Run while the angles are read wrongly; seconds from the first difference of .3 rad to the end of the motion."""
-    began = None
-    for _ in range(round(seconds / CYCLE)):
-        seen = read(bench.position)
-        if began is None and np.abs(seen - bench.position).max() > 0.3:
-            began = bench.now
-        decision = cycle(bench, wave(bench), read=seen, current=np.full(12, 0.05, np.float32), **fields)
-        if decision.reaction >= Reaction.HOLD:
-            return bench.now - began
-    return None
+    return (MIDDLE + 0.5 * FREE * np.sin(bench.now + JOINTS)).astype(np.float32)
 
 
 @pytest.mark.parametrize("moving", [JOINTS >= 0, JOINTS == 4])
@@ -209,16 +192,15 @@ def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench, moving)
 @pytest.mark.parametrize("pair", [[0, 1], [4, 9]])
 def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pair):
     """From the moment at which they are far apart; nearly equal angles are no jump when they are swapped."""
-
-    def swapped(true):
-        return changed(true, pair, true[pair[::-1]])
-
     for _ in range(60):
         cycle(bench, changed(MIDDLE, pair, MIDDLE[pair].min()))
-    assert until_off(bench, swapped) < 1.0
-    for _ in range(round(0.3 / CYCLE)):
-        cycle(bench, wave(bench), read=swapped(bench.position), current=np.zeros(12, np.float32))
-    assert "does not follow its command: at " in bench.safety.latched
+    began = None
+    while not bench.safety.latched:
+        seen = changed(bench.position, pair, bench.position[pair[::-1]])
+        if began is None and np.abs(seen - bench.position).max() > 0.3:
+            began = bench.now
+        cycle(bench, wave(bench), read=seen, current=np.full(12, 0.05, np.float32))
+    assert bench.now - began < 1.3 and "does not follow its command: at " in bench.safety.latched
     assert any(joint_labels(hand)[joint] in bench.safety.latched for joint in pair)
 
 
@@ -236,55 +218,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
 
 
 # --- refusals ------------------------------------------------------------------------------------
-
-
-class Refusing:
-    """A hand that answers `plan` in order: a state, a refusal, or silence (None)."""
-
-    def __init__(self, plan):
-        self.plan, self.sent, self.refusal, self.counts = plan, [], None, LinkCounts()
-
-    def exchange(self, command):
-        step = self.plan[min(len(self.sent), len(self.plan) - 1)]
-        self.sent.append(command)
-        self.refusal = step if isinstance(step, Refusal) else None
-        if step != "state":
-            return None
-        state = frames.empty_state()
-        state["joint"]["position"] = MIDDLE
-        state["joint"]["raw_position"] = command["mode"]
-        now = len(self.sent) * CYCLE
-        return Reply(state, now - CYCLE, now, len(self.sent), 1)
-
-
-def drive(hand, plan, cycles):
-    port, safety = Refusing(plan), Safety(hand, SafetyConfig())
-    loop = ExchangeLoop(port, HandSensing(hand, HardwareConfig()), safety, 83.0, clock=lambda: CYCLE * len(port.sent))
-    for _ in range(AGREEING):
-        loop.cycle()
-    loop.engage()
-    decisions = []
-    for _ in range(cycles):
-        loop.cycle()
-        decisions.append(safety.last)
-    return port, safety, decisions
-
-
-def test_a_hand_that_refuses_for_heat_is_turned_off_with_its_own_words(hand):
-    hot = read_refusal((1501028).to_bytes(4, "little"))
-    port, safety, _ = drive(hand, ["state"] * 15 + [hot, "state", hot, None, hot], 20)
-    assert safety.latched == "the hand reports over-temperature (1501028)"
-    on = [bool(np.all(command["mode"] == Mode.POSITION)) for command in port.sent]
-    assert on[10:20] == [True] * 10 and not any(on[20:])
-
-
-def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand):
-    """Silent first, then busy: the silence counts from its beginning."""
-    busy = read_refusal(b"\x06\x00")
-    _, safety, decisions = drive(hand, ["state"] * 35 + [None] * 50 + [busy], 150)
-    assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
-    held = [k for k, (reaction, _) in enumerate(decisions) if reaction == Reaction.HOLD]
-    assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in decisions
 
 
 @pytest.mark.parametrize(
@@ -317,8 +250,7 @@ def test_serious_refusals_turn_the_motors_off_in_a_row_or_as_every_other_answer(
         alarms.update(2.0 + k, sample(2.0 + k).measured, None)
     alarms.refuse(hot)
     assert not alarms.fatal, "forgiven"
-    alarms.update(20.0, sample(20.0).measured, None)
-    alarms.refuse(hot)
-    alarms.update(21.0, sample(21.0).measured, None)
-    alarms.refuse(hot)
+    for k in range(2):
+        alarms.update(20.0 + k, sample(20.0 + k).measured, None)
+        alarms.refuse(hot)
     assert alarms.fatal == hot.text

@@ -1,5 +1,7 @@
-"""The simulation and the bridge give the same observation, in the same order of action and sensing."""
+"""From measurements to targets as in the simulation; silent sensors of the object; goals of the rotation task."""
 
+import dataclasses
+import math
 from types import SimpleNamespace
 
 import jax
@@ -7,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from remembering import remembering
+from simple_physics import SimplePhysics
+from test_safety import CYCLE, MIDDLE, Bench
 
-pytest.importorskip("serial")
 from dexsim.control import Control
 from dexsim.env.config import Sensing
 from dexsim.env.env import Env
@@ -17,19 +20,23 @@ from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
-from dexsim.physics.interface import PhysicsState, StepResult
+from dexsim.physics.interface import StepResult
 from dexsim.randomization import Randomization
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
-from dexsim.task_spec import TaskSpec
+from dexsim.task_spec import TaskSpec, TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.start import sample_turned_object
-from dexsim.tasks.rotate.task import Rotate
-from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim.tasks.rotate.task import Rotate, goal_quat
+from dexsim_real.control import policy_loop
+from dexsim_real.control.controller import Controller, Tick
+from dexsim_real.control.policy_loop import TurnGoals
+from dexsim_real.control.safety import Reaction
 from dexsim_real.sensors.camera import ObjectEstimate
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.imu import IDENTITY, ImuReader, encode
 from dexsim_real.wire import frames
 
 QUIET = Sensing(
@@ -42,28 +49,15 @@ QUIET = Sensing(
 )
 
 
-class FakePhysics:
-    """Joints that follow torque like a first-order lag and an object that turns: `Env` around it is the real one."""
+class Turning(SimplePhysics):
+    """Its object is touched where it stays, and turns about x."""
 
-    def __init__(self, hand, slots, largest, config, **options):
-        self.backend, self.config = "jax", config
-        self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
-        self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
-        self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
-
-    def tip_stiffness(self, *arguments):
-        return jnp.ones(5)
-
-    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta, held):
-        joints, velocity = state.qpos[:12], state.qvel[:12]
-        torque = law(jnp.asarray(5), joints, velocity)
-        velocity = torque * 2.0
-        joints = joints + self.config.control_period * velocity
+    def advance(self, law, object, state, *others):
+        result = super().advance(law, object, state, *others)
         turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
-        qpos = jnp.concatenate([joints, state.qpos[12:15], turned])
-        qvel = jnp.concatenate([velocity, jnp.zeros(6)])
-        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * joints[:5])) * 3)
-        return StepResult(PhysicsState(qpos, qvel, state.warmstart), force)
+        qpos = jnp.concatenate([result.state.qpos[:12], state.qpos[12:15], turned])
+        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * qpos[:5])) * 3)
+        return StepResult(dataclasses.replace(result.state, qpos=qpos), force)
 
 
 class StillRotate(Rotate):
@@ -140,7 +134,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
 
 def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
     """The real `Env.step` over simple physics, and the bridge fed with frames of what that hand measured."""
-    monkeypatch.setattr("dexsim.env.env.Physics", FakePhysics)
+    monkeypatch.setattr("dexsim.env.env.Physics", Turning)
     config = RotateConfig(
         sensing=QUIET,
         randomization=Randomization(scale=0.0),
@@ -221,7 +215,7 @@ def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_
             carry = policy.initial_carry()
             (controller.start if number == 3 else controller.resume)(measured.joint_position)
         if number == 5:
-            controller.anchor(measured.joint_position)  # with the motors off, at every tick
+            controller.target = measured.joint_position  # with the motors off, at every tick
         if number in (3, 5, 6):
             np.testing.assert_array_equal(controller.target, measured.joint_position)
         tick = controller.tick(measured, seen, IDENTITY, 0.5)
@@ -229,3 +223,104 @@ def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_
         np.testing.assert_array_equal(tick.action, action)
         forgotten += np.abs(tick.action - policy.act(policy.initial_carry(), tick.observation)[1]).max() > 1e-3
     assert forgotten == 6, "all but the first ticks show what came before"
+
+
+class Still:
+    """What the loop needs of a controller, with a policy that stays where it is."""
+
+    def __init__(self, hand):
+        self.hand, self.period = hand, 3 * CYCLE
+        self.spec = SimpleNamespace(turn=None, posture=None, reference=(0.0, 0.0, 0.1))
+
+    def start(self, target):
+        self.target = target
+
+    resume = start
+
+    def tick(self, measured, estimate, goal, command):
+        return Tick(None, None, np.zeros(12), MIDDLE)
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_silent_imu_is_held_within_a_third_of_a_second_then_relaxed(hand, silent):
+    bench, imu = Bench(hand), ImuReader()
+    objects = policy_loop.ObjectSensors(np.zeros(3), None, imu)
+    loop = policy_loop.PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach_seconds=0, place_seconds=0)
+    imu.receive(bench.now, encode(0, IDENTITY))
+    bench.engage()
+    bench.cycle()
+    while loop.approach(bench.now):
+        bench.cycle()
+    loop.begin()
+    start, reactions = bench.now, []
+    for k in range(round(3.0 / CYCLE)):
+        if not (silent and bench.now > start + 1.0):
+            imu.receive(bench.now, encode(k, IDENTITY))
+        if k % 3 == 0 and not bench.safety.latched:
+            assert loop.tick(bench.now) is not None
+        reactions.append((bench.now - start, *bench.safety.last))
+        bench.cycle()
+    held = [(time, reason) for time, reaction, reason in reactions if reaction >= Reaction.HOLD]
+    if silent:
+        assert 1.3 <= held[0][0] < 1.4 and held[0][1] == "the IMU is silent"
+        assert bench.safety.latched == "the IMU is silent for 1 s"
+    else:
+        assert not held and not bench.safety.latched
+
+
+# --- goals of the rotation task ----------------------------------------------------------------------
+
+REFERENCE = (0.047, 0.024, 0.088)
+
+
+def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
+    quat = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis))])
+    return ObjectEstimate(np.array(place), np.zeros(3), quat)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_goals_move_on_as_in_the_task(direction):
+    turn = TurnSpec(step=direction * math.pi / 2)
+    goals = TurnGoals(turn, REFERENCE)
+    rate, period, turns = 0.8 * direction, 0.03, 0
+    for k in range(600):
+        wanted = np.asarray(goal_quat(turns, np.asarray(turn.axis), turn.step))
+        np.testing.assert_allclose(goals.quat, wanted, atol=1e-5)
+        angle = rate * period * k
+        goals.update(period * k, seen(angle))
+        # A goal is reached 0.3 rad before it.
+        turns = max(turns, math.floor((abs(angle) + turn.angle - 1e-9) / abs(turn.step)))
+        assert goals.successes == turns
+    assert turns >= 8 and len(goals.times) == turns
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
+    """Whichever way round the object passes it."""
+    turn = TurnSpec(spin=2.0)
+    fast, far = TurnGoals(turn, REFERENCE), TurnGoals(turn, REFERENCE)
+    for k in range(40):
+        fast.update(0.03 * k, seen(way * 6.0 * 0.03 * k))
+        far.update(0.03 * k, seen(way * 1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
+    assert fast.successes == far.successes == 0
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
+    """q and -q are one orientation; an IMU may give either, from one sample to the next."""
+    turn = TurnSpec(step=direction * math.pi / 2, spin=2.0)
+    goals = TurnGoals(turn, REFERENCE)
+    for k in range(100):
+        estimate = seen(0.8 * direction * 0.03 * k)
+        sign = -1 if k % 2 else 1
+        goals.update(0.03 * k, ObjectEstimate(estimate.position, estimate.velocity, sign * estimate.quat))
+    assert goals.successes == 1
+
+
+@pytest.mark.parametrize(("off", "counts"), [(0.049, True), (0.051, False)])
+def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, counts):
+    turn = TurnSpec(distance=0.05)
+    goals = TurnGoals(turn, REFERENCE)
+    place = np.asarray(REFERENCE) + [0.0, 0.6 * off, 0.8 * off]
+    goals.update(7.5, seen(math.pi / 2, place=place))
+    assert goals.successes == counts and goals.times == [7.5] * counts

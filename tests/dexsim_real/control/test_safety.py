@@ -18,7 +18,7 @@ AGREEING = 10  # readings that make a pose
 SOFT = 0.5  # s, in which stiffness and speed grow after the motors came on
 FREE = np.array([1, 1, 1, 0] + [1] * 8, np.float32)  # All but the joint whose range is small.
 MIDDLE = np.array([0.9, 0.4, 0.8, 0.0] + [0.9] * 8, np.float32)
-SAGGED = (MIDDLE - np.float32(0.4)) * FREE
+SAGGED = MIDDLE - np.float32(0.5) * FREE  # farther than one reading may be from the last with the motors on
 WAYS = pytest.mark.parametrize("way", [np.float32(1), np.float32(-1)])
 UNSEEN = "the object is out of sight"
 
@@ -85,15 +85,10 @@ def bench(hand):
 # --- motors on ---------------------------------------------------------------------------------
 
 
-def test_motors_are_off_until_engaged(hand):
-    bench = Bench(hand)
-    assert bench.cycle(fresh=False).mode == Mode.PASSIVE
-    assert bench.cycle(target=MIDDLE + 0.1).mode == Mode.PASSIVE
-
-
 def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
     bench = Bench(hand)
     bench.position = MIDDLE - np.float32(0.3) * FREE
+    assert bench.cycle(fresh=False).mode == bench.cycle(target=MIDDLE).mode == Mode.PASSIVE, "not engaged"
     bench.engage()
     first = bench.cycle(follow=False)
     assert first.mode == Mode.POSITION
@@ -121,8 +116,8 @@ def test_a_target_of_before_the_motors_came_on_moves_nothing(hand):
     bench = Bench(hand)
     bench.run(0.15, target=MIDDLE + np.float32(0.1) * FREE)
     bench.safety.engage()
-    for decision in bench.run(0.05):
-        assert decision.mode == Mode.POSITION
+    for decision in bench.run(0.3):
+        assert decision.mode == Mode.POSITION and decision.reaction == Reaction.NONE
         np.testing.assert_allclose(decision.position, MIDDLE, atol=2e-7)
 
 
@@ -211,11 +206,14 @@ def test_time_that_a_late_cycle_has_missed_is_not_made_up_for(hand, way, pause):
     np.testing.assert_allclose((decision.position - MIDDLE)[FREE > 0], way * 2.0 * min(pause, 0.03), rtol=1e-3)
 
 
-@pytest.mark.parametrize("back", [0.03, 50.0])
-def test_a_clock_that_goes_back_moves_no_joint(bench, back):
-    before = bench.position.copy()
+@pytest.mark.parametrize("back", [0.03, 0.5, 50.0])
+def test_a_clock_that_goes_back_moves_no_joint_away(bench, back):
+    """Also where the speed has just begun to grow, after a hold."""
+    bench.cycle(target=MIDDLE, hold=UNSEEN)
+    before, target = bench.cycle(target=MIDDLE).position, MIDDLE + np.float32(0.5) * FREE
     bench.now -= back
-    np.testing.assert_array_equal(bench.cycle(target=MIDDLE + np.float32(0.5) * FREE).position, before)
+    np.testing.assert_array_equal(bench.cycle(target=target).position, before)
+    assert np.all(bench.run(0.1, target=target)[-1].position >= before)
 
 
 def test_the_defaults_are_below_what_the_hand_can_do_and_above_what_policies_ask(hand):
@@ -229,16 +227,6 @@ def test_the_defaults_are_below_what_the_hand_can_do_and_above_what_policies_ask
 
 
 # --- holds ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("bad", [np.nan, -np.inf])
-def test_a_target_that_is_not_finite_holds_the_last_command(bench, bad):
-    target = MIDDLE.copy()
-    target[7] = bad
-    decision = bench.cycle(target=target)
-    assert decision.reaction == Reaction.HOLD and decision.mode == Mode.POSITION
-    np.testing.assert_array_equal(decision.position, MIDDLE)
-    assert bench.cycle(target=MIDDLE).reaction in (Reaction.NONE, Reaction.CLIP)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +253,9 @@ def test_a_firm_grasp_and_a_fast_joint_go_on_up_to_their_limits(bench, measureme
     assert not held or np.abs(after.position - before).max() <= 0.7 * CYCLE
 
 
-@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"target": np.full(12, np.nan)}])
+@pytest.mark.parametrize(
+    "event", [{"velocity": 25.0}, *({"target": np.where(np.arange(12) == 7, bad, 1)} for bad in (np.nan, -np.inf))]
+)
 def test_hold_keeps_the_last_confirmed_command(bench, event):
     """The hand is pressed away from its command; hold keeps the command."""
     target = MIDDLE + np.float32(0.15) * FREE
@@ -274,8 +264,9 @@ def test_hold_keeps_the_last_confirmed_command(bench, event):
     bench.cycle(target=target, follow=False)
     for _ in range(20):
         decision = bench.cycle(**{"target": target, "follow": False} | event)
-        assert decision.reaction == Reaction.HOLD
+        assert decision.reaction == Reaction.HOLD and decision.mode == Mode.POSITION
         np.testing.assert_array_equal(decision.position, target)
+    assert bench.cycle(target=target).reaction < Reaction.HOLD
 
 
 def test_a_command_that_was_not_answered_is_not_held(bench):

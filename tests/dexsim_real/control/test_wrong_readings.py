@@ -1,15 +1,12 @@
 """Wrong readings of the hand: they are no measurements, and no command follows them."""
 
-import sys
-import threading
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, UNSEEN, Bench, ready, sample
 
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
-from dexsim_real.control.safety import Reaction
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import Mode
@@ -54,24 +51,17 @@ def test_the_first_reading_after_the_motors_came_on_may_be_wrong_as_well(hand):
     assert "index_joint1 reads 1.5 rad" in bench.safety.problem
 
 
-def test_wrong_angles_that_last_turn_the_motors_off_and_name_the_joint(bench):
-    bench.position = wrong(4, 1.9)
-    decisions = bench.run(1.2, target=MIDDLE, follow=False)
-    assert decisions[-1].mode == Mode.PASSIVE
-    assert all(np.array_equal(d.position, MIDDLE) for d in decisions if d.mode == Mode.POSITION)
-    assert "implausible" in bench.safety.latched and "index_joint1 reads 1.9 rad" in bench.safety.latched
-
-
-@pytest.mark.parametrize("right", [2, 4, 40])
-def test_right_readings_between_wrong_ones_do_not_hide_them(bench, right):
-    """One right reading of so many: commands would follow it, and nothing would tell."""
+@pytest.mark.parametrize("right", [2, 4, 40, 1000])
+def test_wrong_angles_that_last_turn_the_motors_off_and_name_the_joint(bench, right):
+    """Also with one right reading of so many: commands would follow it, and nothing would tell."""
     start = bench.now
     for k in range(round(6.0 / CYCLE)):
         bench.position = MIDDLE if k % right == 0 else wrong(4, 1.9)
-        bench.cycle(target=MIDDLE, follow=False)
+        decision = bench.cycle(target=MIDDLE, follow=False)
         if bench.safety.latched:
             break
-    assert bool(bench.safety.latched) == (right > 2)
+        np.testing.assert_array_equal(decision.position, MIDDLE)
+    assert (decision.mode == Mode.PASSIVE) == bool(bench.safety.latched) == (right > 2)
     assert right == 2 or "joint index_joint1 reads 1.9 rad" in bench.safety.latched and bench.now - start < 4.5
 
 
@@ -180,25 +170,17 @@ def test_commands_explain_a_motion_since_the_last_reading_and_not_later(check, w
         assert check.judge(0.5 + k * CYCLE, pose(START + way * 0.5), pose())
 
 
-@pytest.mark.parametrize("apart", [0.049, 0.051, -0.051])
-@pytest.mark.parametrize("at", [0, 9])
-def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
-    """With the motors off; wherever among the last ten the wrong one is, the pose is the median."""
+@pytest.mark.parametrize(
+    ("off", "known"),
+    [({0: 0.049}, 1), ({9: 0.049}, 1), ({0: 0.051}, 0), ({9: -0.051}, 0), ({1: 0.04, 2: 0.04, 8: 0.04, 9: 0.04}, 1)],
+)
+def test_a_pose_is_the_median_of_ten_readings_that_agree(hand, off, known):
+    """With the motors off; wherever among them the wrong ones are."""
     check = PoseCheck(hand)
     for k in range(AGREEING):
         assert check.at_rest is None
-        assert check.judge(k * CYCLE, pose(START + apart * (k == at)), None) == ""
-    if abs(apart) > 0.05:
-        assert check.at_rest is None
-    else:
-        np.testing.assert_array_equal(check.at_rest, pose())
-
-
-def test_four_equal_wrong_readings_of_ten_do_not_move_the_pose(hand):
-    check = PoseCheck(hand)
-    for k in range(AGREEING):
-        check.judge(k * CYCLE, pose(START + 0.04 * (k in (1, 2, 8, 9))), None)
-    np.testing.assert_array_equal(check.at_rest, pose())
+        assert check.judge(k * CYCLE, pose(START + off.get(k, 0.0)), None) == ""
+    np.testing.assert_array_equal(check.at_rest, pose() if known else None)
 
 
 @pytest.mark.parametrize("angle", [2.02, -0.11])
@@ -280,28 +262,13 @@ def test_a_command_that_is_not_finite_never_leaves(hand):
             sensing.command(np.where(np.arange(12) == 7, bad, 0.5), Mode.POSITION)
 
 
-@settings(max_examples=5, deadline=None)
-@given(st.lists(st.one_of(st.just(np.nan), st.just(np.inf), st.floats(-2, 2, width=32)), min_size=2, max_size=6))
-def test_a_second_thread_that_writes_any_target_puts_nothing_wrong_on_the_wire(hand, targets):
-    bench, sensing, stop = Bench(hand), HandSensing(hand, HardwareConfig()), threading.Event()
-    bench.engage()
-
-    def write():
-        while not stop.is_set():
-            for target in targets:
-                bench.safety.set_target(np.full(12, target), bench.now)
-
-    before, thread = sys.getswitchinterval(), threading.Thread(target=write)
-    sys.setswitchinterval(1e-6)
-    thread.start()
-    try:
-        sent = []
-        for _ in range(200):
-            decision = bench.cycle()
-            sent.append(sensing.command(decision.position, decision.mode)["position"])
-    finally:
-        stop.set()
-        thread.join()
-        sys.setswitchinterval(before)
-    assert np.isfinite(sent).all()
-    assert np.abs(np.diff(sent, axis=0)).max() <= 8.0 * CYCLE + 1e-5
+def test_another_thread_may_change_a_target_at_any_moment(bench):
+    """It is copied as it is set, and read once a cycle."""
+    target, reads = MIDDLE.copy(), []
+    bench.cycle(target=target)
+    target[:] = np.nan
+    assert bench.cycle().reaction == Reaction.NONE
+    now = bench.safety._target
+    bench.safety.__class__ = type("Changing", (Safety,), {"_target": property(lambda self: reads.pop(0))})
+    reads += [now, now._replace(position=np.full(12, np.nan)), None]
+    assert bench.cycle().reaction == Reaction.NONE

@@ -1,16 +1,22 @@
-"""Runs of a policy on a scripted hand: whatever ends them, the motors go off."""
+"""Runs of a policy on a scripted hand: what ends them turns the motors off, what they lack is said, what they show."""
 
+import contextlib
 import dataclasses
+import io
+import os
+import re
+import select
+import socket
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
+import memory_line
 import numpy as np
 import pytest
-
-pytest.importorskip("serial")
-import memory_line
 from following_hand import FollowingHand, arguments, records, summary
+from rich.console import Console
 from scripted_driver import ScriptedDriver
 
 import dexsim_real
@@ -23,14 +29,19 @@ from dexsim_real import replay
 from dexsim_real.control.controller import Controller
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import limits_for
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind
+from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.loop import TARE_SAMPLES
-from dexsim_real.run import __main__ as run
+from dexsim_real.run import __main__ as run, session, status
+from dexsim_real.run.session import Outcome
+from dexsim_real.sensors.camera import encode_mask
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.wire.frames import Command, Frame
-from dexsim_real.wire.link import LinkConfig
+from dexsim_real.wire.frames import Command, Frame, empty_state
+from dexsim_real.wire.link import LinkConfig, Refusal
 
+pytest.importorskip("serial")
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
 
@@ -113,7 +124,7 @@ def test_a_left_hand_runs_the_policy_of_the_right_one_and_a_right_hand_is_refuse
             run.main(arguments(peer, tmp_path / "refused", *options))
         peer.registers = {20: b"left", 21: b"2L32SCRIPTED"}
         assert run.main(arguments(peer, tmp_path, *options)) == 0
-    again = replay.replay(tmp_path / "run.log")
+    again = replay.Replay(tmp_path / "run.log")
     assert again.hand.name == "xhand_left" and again.report["first_difference"] is None
 
 
@@ -147,7 +158,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
     link = summary(tmp_path)["link"]
     assert link["corrupt"] + link["silent"] == len(faults) > 5 and link["late"] == 0
     assert link["sent"] == sum(link[end] for end in ("answered", "corrupt", "silent", "refused", "lost"))
-    assert replay.replay(tmp_path / "run.log").report["first_difference"] is None
+    assert replay.Replay(tmp_path / "run.log").report["first_difference"] is None
 
 
 @pytest.mark.parametrize(
@@ -223,3 +234,204 @@ def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
     for file in (tmp_path / "secret", tmp_path, tmp_path / "none.toml", "/dev/zero"):
         with pytest.raises(ConfigError, match="is missing: give --hand FILE"):
             recorded_hand(record | {"file": str(file)}, None, "policy.msgpack")
+
+
+def lines(capsys):
+    return [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+
+
+def test_a_hand_that_was_gone_for_most_of_the_run(tmp_path, capsys):
+    """It answers again before the end, so that the motors are confirmed to be off."""
+    begin = []
+
+    def trouble(index, state):
+        if peer.on().sum() > 30:
+            begin.append(time.monotonic())
+            return b"" if time.monotonic() - begin[0] < 0.9 else None
+
+    with FollowingHand(trouble) as peer:
+        quick = {"--safety.stale": "0.1", "--link.margin": "0.02"}
+        options = arguments(peer, tmp_path, "--seconds", "1.5", "--safety.patience", "0.2")
+        options = [quick.get(before, text) for before, text in zip(["", *options], options, strict=False)]
+        assert run.main(options) == 1
+    assert summary(tmp_path)["end"] == "time is over" and summary(tmp_path)["motors_off"]
+    (line,) = lines(capsys)
+    assert "no measurement for " in line and "the policy were not finite" not in line
+
+
+def test_a_policy_whose_actions_are_not_finite(tmp_path, capsys, monkeypatch):
+    real = Controller.tick
+
+    def tick(self, *inputs):
+        return dataclasses.replace(real(self, *inputs), target=np.full(12, np.nan, np.float32))
+
+    monkeypatch.setattr(Controller, "tick", tick)
+    with FollowingHand() as peer:
+        assert run.main(arguments(peer, tmp_path, "--seconds", "0.5")) == 1
+    (line,) = lines(capsys)
+    number = summary(tmp_path)["missing"][0].split()[0]
+    assert f"error: {number} of {number} actions of the policy were not finite; the hand was held for" in line
+    assert "last because: target is not finite" in line
+
+
+def test_a_camera_that_is_lost(tmp_path):
+    """Its pictures end while the hand holds the object: hold, then motors off, as the manual says."""
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(tmp_path / "masks"))
+    server.listen()
+    mask = np.zeros((481, 643), bool)
+    mask[230:250, 310:330] = True
+
+    def show():
+        link = server.accept()[0]
+        for _ in range(40):
+            link.sendall(encode_mask(time.monotonic(), mask))
+            time.sleep(0.03)
+        link.close()
+
+    thread = threading.Thread(target=show)
+    thread.start()
+    with FollowingHand() as peer:
+        options = arguments(peer, tmp_path, "--seconds", "30", "--safety.patience", "0.3")
+        options[options.index("--fixed-object")] = f"--camera=unix:{tmp_path / 'masks'}"
+        assert run.main(options) == 1
+        on, seconds = peer.on(), np.ptp(peer.times)
+    thread.join()
+    assert on.any() and not on[-1] and seconds < 20, "of 30: the pictures last 1.2 s, a busy machine some more"
+    assert summary(tmp_path)["end"] == "stopped: the camera sends no more pictures for 0.3 s"
+
+
+def test_a_whole_run_lacks_nothing_and_what_may_be_missing(hand, tmp_path):
+    """A tenth of the time without a measurement, half of it held or with the motors off."""
+    with LogWriter(tmp_path / "a.log") as writer:
+        pass
+    safety = Safety(hand, SafetyConfig())
+
+    def missing(blind=0, held=0, reaction=Reaction.HOLD, engaged=True):
+        outcome, safety.engaged = Outcome(), engaged
+        for k in range(100):
+            safety.last = (reaction, "a joint is too fast") if k < held else (Reaction.CLIP, "")
+            outcome.add(None if k < blind else np.zeros(12), safety)
+        return outcome.missing(writer)
+
+    assert missing() == missing(9, 49) == missing(held=100, engaged=False) == []
+    assert missing(blind=11) == ["no measurement for 11 % of the run"]
+    for reaction in (Reaction.HOLD, Reaction.RELAX):
+        (line,) = missing(held=51, reaction=reaction)
+        assert line == "the hand was held for 51 % of the run, last because: a joint is too fast"
+    safety.alarms.refuse(Refusal("the hand reports busy", serious=False))
+    assert missing(blind=50) == ["no measurement for 50 % of the run (the hand reports busy)"]
+    writer.dropped, writer.failure = 3, "No space left on device"
+    assert missing() == ["3 log records are lost (No space left on device)"]
+
+
+def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
+    """Every number differs, and is as wide as it can be."""
+    block = empty_state()
+    joint, tip = block["joint"], block["tip"]
+    joint["position"] = np.linspace(-0.101, 1.9, 12)
+    joint["current"] = -np.arange(1110, 1230, 10)
+    joint["temperature"] = np.arange(101, 113) + 256 * 42  # the palm's in the high byte
+    joint["palm_error"][3], joint["joint_error"][3], joint["tip_error"][11] = 0x0101, 0xFFFF, 0x8000
+    tip["taxel"]["z"][:, :3] = np.arange(200, 205)[:, None]
+    tip["temperature"] = np.arange(121, 126)
+    measured, targets = HandSensing(hand, HardwareConfig()).measure(block), np.linspace(-2, 1.8, 12)
+    tables = status.hand_tables(hand, measured, targets, True)
+    view = status.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables)
+    view.console = Console(width=100, file=io.StringIO())
+    view.show()
+    shown = view.console.file.getvalue()
+    lines = shown.splitlines()
+    assert len(lines) <= 29 and "…" not in shown
+    for number, name in enumerate(hand.joint_names):
+        errors = {3: "0101 ffff -", 11: "- - 8000"}.get(number, "- - -")
+        row = f"{number} {name} {joint['position'][number]:.3f} {targets[number]:.3f} {1.11 + 0.01 * number:.2f}"
+        assert any(" ".join(line.split()).startswith(f"{row} {101 + number} {errors}") for line in lines), row
+    for finger, name in enumerate(hand.finger_names):
+        assert re.search(rf"{name} +{60 + 0.3 * finger:.1f} +{121 + finger}$", shown, re.MULTILINE)
+    assert re.search(r"sum +303.0 *$", shown, re.MULTILINE) and re.search(r"palm board +42$", shown, re.MULTILINE)
+    assert "not sent" not in shown
+    tables = status.hand_tables(hand, measured, None, False)
+    view.show()
+    assert "(not sent)" in view.console.file.getvalue()
+
+
+def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, capsys):
+    with FollowingHand() as peer:
+        options = [o for o in arguments(peer, tmp_path, "--seconds", "0.9", "--motors-off") if o != "--quiet"]
+        assert run.main(options) == 0
+        assert peer.commands and not peer.on().any()
+    assert len(records(tmp_path, Kind.TICK)) >= 5
+    shown = capsys.readouterr().err
+    for text in ("firmware 1.3.9", "the policy starts", "exchange jitter", "end: time is over", "round trip"):
+        assert text in shown, text
+
+
+@pytest.mark.parametrize("gone", ["window", "pipe"])
+def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
+    """An SSH connection that broke, a `tee` that Ctrl-C ended: with Rich alone the exchange thread would end."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(status, "_LIVE", 0.02)
+    far, near = os.openpty() if gone == "window" else os.pipe()
+    screen = os.fdopen(near, "w", buffering=1)
+    monkeypatch.setattr("sys.stderr", screen)
+    view = status.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "")
+    os.close(far)
+    try:
+        view.note("before")
+        view.show()
+        with pytest.raises(SystemExit, match="129"), view:
+            time.sleep(0.1)
+            raise SystemExit(129)
+        view.note("end")
+    finally:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), near)  # What the stream still holds can be written now.
+        screen.close()
+
+
+# --- the question --------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    """Somebody who types an answer; `motors` says whether they were on when the question came."""
+
+    def __init__(self, answer, peer):
+        super().__init__(answer)
+        self.peer, self.motors = peer, None
+
+    def isatty(self):
+        return True
+
+    def readline(self, *size):
+        self.motors = bool(self.peer.on().any())
+        return super().readline(*size)
+
+
+@pytest.mark.parametrize(("answer", "moves"), [("y\n", True), ("", False), ("yeah\n", False)])
+def test_the_motors_come_on_after_a_yes_and_after_nothing_else(tmp_path, monkeypatch, answer, moves):
+    with FollowingHand() as peer:
+        terminal = Terminal(answer, peer)
+        monkeypatch.setattr("sys.stdin", terminal)
+        monkeypatch.setattr("sys.stderr", Terminal("", peer))
+        options = [o for o in arguments(peer, tmp_path, "--seconds", "0.2") if o != "--yes"]
+        with contextlib.nullcontext() if moves else pytest.raises(HandError, match="the motors stayed off"):
+            run.main(options)
+        assert terminal.motors is False and peer.commands and peer.on().any() == moves
+    assert moves or "not confirmed" in records(tmp_path, Kind.END)[0]["end"]
+
+
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
+    """The motors come on at a pose that has been shown."""
+    master, slave = os.openpty()
+    try:
+        with os.fdopen(slave) as terminal:
+            monkeypatch.setattr("sys.stdin", terminal)
+            os.write(master, b"y\n")
+            assert select.select([terminal], [], [], 5)[0]
+            error = SimpleNamespace(write=lambda text: os.write(master, b"n\n"), flush=lambda: None)
+            monkeypatch.setattr("sys.stderr", error)
+            with pytest.raises(HandError, match="the motors stayed off"):
+                session.ask()
+    finally:
+        os.close(master)

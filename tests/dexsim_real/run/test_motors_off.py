@@ -1,8 +1,9 @@
-"""Whatever ends a run, the motors go off: signals in a row, a lost cable, SIGKILL. The hand has no watchdog."""
+"""Whatever ends a run, the motors go off: signals, a lost cable, SIGKILL, a frozen runner. The hand has no watchdog."""
 
 import contextlib
 import os
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -10,17 +11,17 @@ import time
 
 import numpy as np
 import pytest
-from paths import ROOT
-
-pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, summary
+from paths import ROOT
 from pty_hand import QUICK
 
 from dexsim import load_hand
+from dexsim_real.control import guard
+from dexsim_real.control.guard import Guard
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import ignore_signals, stopping
-from dexsim_real.run.guard import Guard
-from dexsim_real.wire.frames import empty_state, passive_command
-from dexsim_real.wire.link import HandPort, Reply
+
+pytest.importorskip("serial")
 
 
 def runner(peer, folder, *without):
@@ -88,30 +89,22 @@ def test_only_the_first_signal_interrupts():
 
 def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
     """Interrupted while the cable is out: the motors go off when it returns, a second later. The guard lets it try."""
-    with FollowingHand() as peer:
-        process = runner(peer, tmp_path, "--no-guard")
-        try:
-            wait(lambda: peer.on().sum() > 60)
-            peer.close()
-            time.sleep(0.2)
-            process.send_signal(signal.SIGINT)
-            time.sleep(1.0)
-            assert process.poll() is None
-            peer.open()
-            asked = len(peer.commands)
-            assert process.wait(20) == 130
-            assert len(peer.commands) > asked and not peer.on()[asked:].any()
-        finally:
-            process.kill()
-            process.communicate()
+    with moving(tmp_path, "--no-guard") as (peer, process):
+        peer.close()
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        time.sleep(1.0)
+        assert process.poll() is None
+        peer.open()
+        asked = len(peer.commands)
+        assert process.wait(20) == 130
+        assert len(peer.commands) > asked and not peer.on()[asked:].any()
     assert summary(tmp_path)["motors_off"]
 
 
 @pytest.mark.slow
 def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
-    with FollowingHand() as peer:
-        process = runner(peer, tmp_path, "--no-guard")
-        wait(lambda: peer.on().sum() > 60)
+    with moving(tmp_path, "--no-guard") as (peer, process):
         peer.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 1
@@ -119,29 +112,8 @@ def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
         peer.open()
         wait(lambda: len(peer.commands) > asked, 20.0)
         assert not peer.on()[asked:].any()
-        process.communicate()
     report = summary(tmp_path)
     assert not report["motors_off"] and "press the emergency stop" in report["end"]
-
-
-def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
-    """A procedure has no guard process: an error of the driver must not leave the motors on."""
-
-    class Failing(HandPort):
-        def __init__(self, answers):
-            self.answers = answers
-
-        def exchange(self, command):
-            answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-            if isinstance(answer, BaseException):
-                raise answer
-            return answer
-
-    gone, reply = OSError("the adapter is gone"), Reply(empty_state(), 0.0, 0.0, 1, 1)
-    port = Failing([gone, None, False, SystemExit(1), reply])
-    assert port.turn_off(passive_command(), 5.0) and port.answers == [reply]
-    for answer in (gone, False, True):
-        assert not Failing([answer]).turn_off(passive_command(), 0.05)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
@@ -164,3 +136,95 @@ def test_the_guard_waits_for_a_cable():
         wait(lambda: len(peer.commands) > 0, 5.0)
         assert not peer.on().any()
         assert guard._process.wait(10) == 0
+
+
+@pytest.fixture
+def peer():
+    with FollowingHand() as peer:
+        yield peer
+
+
+@pytest.mark.parametrize("wakes", [True, False])
+def test_a_machine_that_paused_gets_a_second_look(monkeypatch, wakes):
+    """When all of it stood still, the runner's sign is overdue as the guard wakes, and comes a moment later."""
+    near, far = os.pipe()
+    os.write(far, b"0.05\n")
+    real, looks = select.select, []
+
+    def look(read, write, error, seconds):
+        looks.append(seconds)
+        if len(looks) == 3 and wakes:
+            os.write(far, b"off\n")
+            os.close(far)
+        return real(read, write, error, seconds)
+
+    monkeypatch.setattr(guard.select, "select", look)
+    assert guard._watch(near, os.open(os.devnull, os.O_WRONLY)) == ("" if wakes else guard._FROZEN)
+    assert looks[2] == guard._MOMENT
+
+
+def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
+    patience = guard._ANSWER
+    assert patience + guard._MOMENT < 1.0
+    monkeypatch.setattr(guard, "_ANSWER", 20.0)  # A busy machine is not a suspended guard.
+    watched = Guard(peer.port, QUICK, load_hand())
+    try:
+        assert select.select([watched._output], [], [], 20)[0]
+        watched.check()  # A node asks before its motors come on.
+        watched.arm()
+        for _ in range(20):
+            watched.beat()
+            watched.check()
+            time.sleep(0.02)
+        until = time.monotonic() + 20
+        while watched._asked is not None and time.monotonic() < until:
+            watched.check()
+        assert watched._asked is None, "it answers"
+        os.kill(watched._process.pid, signal.SIGSTOP)
+        monkeypatch.setattr(guard, "_ANSWER", patience)
+        begin = time.monotonic()
+        with pytest.raises(HandError, match="the guard process does not respond"):
+            while time.monotonic() < begin + 10:
+                watched.beat()
+                watched.check()
+                time.sleep(0.02)
+    finally:
+        watched._process.kill()
+
+
+def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(peer, tmp_path, monkeypatch):
+    """What it prints is no word of the guard's, and has no reader once the runner is gone."""
+    (tmp_path / "loud_sdk.py").write_text(
+        "import sys\n"
+        "from dexsim_real.wire.driver import DriverState\n"
+        "from dexsim_real.wire.frames import Mode, passive_command\n"
+        "from dexsim_real.wire.serial_hand import SerialHand\n"
+        "print('SDK 1.0', flush=True)\n"
+        "opened = []\n"
+        "class Loud:\n"
+        "    measures = frozenset()\n"
+        "    def __init__(self, *given):\n"
+        "        self.hand = SerialHand(*given)\n"
+        "    def send(self, targets):\n"
+        "        assert not targets.on\n"
+        "    def read(self):\n"
+        "        reply = self.hand.exchange(passive_command())\n"
+        "        return reply and DriverState(reply.state['joint']['position'], reply.state['joint']['id'] < 0)\n"
+        "    def connect(self):\n"
+        "        print('connecting', flush=True)\n"
+        "        if len(opened) < 2:\n"
+        "            sys.exit('not found')\n"
+        "        return self.hand.connect()\n"
+        "    def close(self):\n"
+        "        self.hand.close()\n"
+        "        raise RuntimeError('close failed')\n"
+        "def open_hand(hand, config):\n"
+        "    opened.append(config)\n"
+        f"    return Loud({peer.port!r}, config)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    armed = Guard("sdk:loud_sdk", QUICK, load_hand())
+    armed.arm()
+    armed.dismiss(off=False)
+    assert armed._process.wait(10) == 0
+    assert peer.commands and not peer.on().any()

@@ -1,4 +1,4 @@
-"""The object's sensors: IMU frames, parser, alignment, port; when a policy may begin."""
+"""The object's sensors: height from masks; IMU frames, alignment, jumps and port; when a policy may begin."""
 
 import math
 import time
@@ -6,37 +6,93 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
+from hypothesis import example, given, strategies as st
 from scipy.spatial.transform import Rotation
 
-from dexsim.geometry import rotations
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors import imu
-from dexsim_real.sensors.camera import ObjectSensors
+from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, camera_axes, height_of
 from dexsim_real.sensors.imu import IDENTITY
+
+REFERENCE = np.array([0.055, -0.005, 0.09])  # m
+
+
+def picture(point, config, radius=9, shape=(480, 640)):
+    """A disc at a point's projection."""
+    right, down, forward = camera_axes(config)
+    at = np.asarray(point) - np.asarray(config.position)
+    column, row = config.centre + np.array(config.focal) * [at @ right, at @ down] / (at @ forward)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return (rows - row) ** 2 + (columns - column) ** 2 <= radius**2
+
+
+@given(st.floats(0.0, 0.12), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.sampled_from([(600, 800), (800, 600)]))
+def test_height_from_a_mask(height, yaw, pitch, focal):
+    config = CameraConfig(
+        focal=focal,
+        position=(0.05 + 0.4 * math.sin(pitch), 0.5, 0.1 + 0.3 * math.sin(yaw)),
+        forward=(-math.sin(pitch), -1.0, -math.sin(yaw) * 0.6),
+        down=(1.0, 0.2, 0.1),
+    )
+    # Half a pixel at half a metre and 600 px is 0.4 mm.
+    mask = picture([height, *REFERENCE[1:]], config)
+    assert height_of(mask, config, REFERENCE, 0) == pytest.approx(height, abs=6e-4)
+
+
+def tracking(masks):
+    return HeightSensor(masks, CameraConfig(), REFERENCE, (True, False, False), 0.5)
+
+
+def until(condition):
+    end = time.monotonic() + 20
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return condition()
+
+
+def test_velocity_is_filtered_as_in_the_simulation():
+    config, sensor = CameraConfig(), tracking(lambda: None)
+    for k in range(8):
+        sensor.update(0.03 * k, picture(REFERENCE + [0.004 * k, 0, 0], config))
+        sensor.update(0.03 * k + 0.01, np.zeros((480, 640), bool))  # Out of sight for a moment.
+        sensor.update(0.03 * k - 0.02, picture(REFERENCE, config))  # Late, and says nothing new.
+    when, position, velocity = sensor.read()
+    assert when == pytest.approx(0.21)
+    np.testing.assert_allclose(position, REFERENCE + [0.028, 0, 0], atol=6e-4)
+    assert velocity[0] == pytest.approx(0.004 / 0.03 * (1 - 0.5**7), rel=0.15) and not velocity[1:].any()
+    sensor.close()
+
+
+def test_a_camera_that_ends_or_fails_says_so():
+    def broken():
+        raise RuntimeError("the lens\nfell off")
+
+    for masks, says in ((lambda: None, "sends no more pictures"), (broken, "the camera failed: the lens fell off")):
+        sensor = tracking(masks)
+        assert until(lambda sensor=sensor: sensor.failure) and says in sensor.failure
+        sensor.close()
+
+
+@pytest.mark.parametrize("when", [1.7e9 * 10, math.nan])
+def test_a_picture_of_another_clock_does_not_stay_young(when):
+    pictures = iter([(when, picture(REFERENCE, CameraConfig())), None])
+    sensor = tracking(lambda: next(pictures))
+    assert until(lambda: sensor.has_measurement) and sensor.read()[0] <= time.monotonic()
+    sensor.close()
+
 
 DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
 
 
-def quat_of(yaw, pitch, roll):
+def quat_of(yaw, pitch=0.0, roll=0.0):
     """Yaw, then pitch, then roll, each about the part's own axis; degrees."""
-    quat = IDENTITY
-    for axis, angle in (((0, 0, 1), yaw), ((0, 1, 0), pitch), ((1, 0, 0), roll)):
-        half = math.radians(angle) / 2
-        turn = np.array([math.cos(half), *(math.sin(half) * np.array(axis))])
-        quat = np.asarray(rotations.quat_multiply(quat, turn))
-    return quat
-
-
-def heading(angle):
-    """The orientation after a turn about the vertical, rad."""
-    return np.array([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])
+    return np.roll(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_quat(), 1)
 
 
 def apart(a, b):
-    """Angle between two orientations, rad, by their matrices."""
-    a, b = (np.asarray(rotations.quat_to_matrix(np.asarray(q, np.float32))) for q in (a, b))
-    return math.acos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1))
+    """Angle between two orientations, rad."""
+    a, b = (Rotation.from_quat(np.roll(q, -1)) for q in (a, b))
+    return (a.inv() * b).magnitude()
 
 
 def test_the_datasheets_example_message():
@@ -51,23 +107,6 @@ def test_the_datasheets_example_message():
 def test_orientations_survive_the_wire(yaw, pitch, roll, index):
     quat = quat_of(yaw, pitch, roll)
     assert apart(imu.decode(imu.encode(index, quat)), quat) < 2e-3
-
-
-@settings(max_examples=50)
-@given(
-    st.lists(st.one_of(st.binary(max_size=30), st.just(b"\xaa"), st.just(DATASHEET[:9])), max_size=20),
-    st.integers(1, 40),
-)
-def test_the_imu_parser_recovers_from_noise(parts, size):
-    stream = b"".join(parts) + 4 * DATASHEET
-    parser, found = imu.make_parser(), []
-    for at in range(0, len(stream), size):
-        found += parser.feed(stream[at : at + size])
-        assert parser.pending <= imu.SIZE + size
-    # One in 256 false heads passes the checksum, and then takes the next frame's beginning with it.
-    assert len(found) >= 3 and all(apart(quat, imu.decode(DATASHEET)) < 1e-6 for _, quat in found[-3:])
-    if not parts:
-        assert len(found) == 4 and parser.damaged == 0
 
 
 def turns(most):
@@ -88,26 +127,26 @@ def test_one_known_pose_aligns_all_three_angles(world, first, turn):
 def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():
     """In virtual time: a frame that repeats its index, one damaged sample, and a reference that is lost for good."""
     reader = imu.ImuReader()
-    reader.receive(0.0, imu.encode(0, quat_of(0, 0, 0)))
+    reader.receive(0.0, imu.encode(0, quat_of(0)))
     reader.calibrate(IDENTITY)
     objects = ObjectSensors(np.zeros(3), None, reader)
     for tick in range(1, 101):
         turned = 0.01 * tick * 90  # degrees: 90 degrees in a second
-        index, quat = tick, quat_of(turned, 0, 0)
+        index, quat = tick, quat_of(turned)
         if tick == 30:
-            quat = quat_of(turned + 170, 0, 0)
+            quat = quat_of(turned + 170)
         if tick > 60:
-            index, quat = 60, quat_of(54, 0, 0)
+            index, quat = 60, quat_of(54)
         reader.receive(0.01 * tick, imu.encode(index, quat))
         when, orientation = reader.read()
         expected = 0.9 * min(29 if tick == 30 else tick, 60)
-        assert apart(orientation, quat_of(0, 0, 0)) == pytest.approx(math.radians(expected), abs=2e-3)
+        assert apart(orientation, quat_of(0)) == pytest.approx(math.radians(expected), abs=2e-3)
     assert when == pytest.approx(0.6) and objects.lost(1.0, 0.3) == "the IMU is silent"
     for tick in range(101, 201):
-        reader.receive(0.01 * tick, imu.encode(tick, quat_of(54 + 120, 0, 0)))
+        reader.receive(0.01 * tick, imu.encode(tick, quat_of(54 + 120)))
         assert (objects.lost(0.01 * tick, 9.0) == "the orientation that the IMU sends has jumped") == (tick >= 105)
-    assert apart(reader.read()[1], quat_of(0, 0, 0)) == pytest.approx(math.radians(54), abs=2e-3)
-    reader.receive(2.01, imu.encode(201, quat_of(50, 0, 0)))
+    assert apart(reader.read()[1], quat_of(0)) == pytest.approx(math.radians(54), abs=2e-3)
+    reader.receive(2.01, imu.encode(201, quat_of(50)))
     assert not objects.lost(2.01, 0.3), "it has come back"
 
 
@@ -119,7 +158,7 @@ def test_an_orientation_that_jumps_and_stays_is_noticed_within_a_tenth_of_a_seco
     noticed = None
     for tick in range(100):
         time = 0.01 * (tick // 4 * 4 + 3 if burst else tick)
-        reader.receive(time, imu.encode(tick, heading(0.003 * tick + math.radians(angle) * (tick >= 40))))
+        reader.receive(time, imu.encode(tick, quat_of(math.degrees(0.003 * tick) + angle * (tick >= 40))))
         if tick == 0:
             reader.calibrate(IDENTITY)
             objects = ObjectSensors(np.zeros(3), None, reader)
@@ -137,7 +176,7 @@ def test_a_fast_object_and_lost_frames_are_no_jump(speeds, lost, together):
         angle += 0.01 * speed
         if not (lost and lost <= tick < lost + 9):
             time = 0.01 * (tick - tick % together)
-            reader.receive(time, imu.encode(tick, heading(angle)))
+            reader.receive(time, imu.encode(tick, quat_of(math.degrees(angle))))
         if tick == 0:
             reader.calibrate(IDENTITY)
             before = reader.read()[1]
@@ -148,7 +187,7 @@ def test_a_fast_object_and_lost_frames_are_no_jump(speeds, lost, together):
 def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():
     reader = imu.ImuReader()
     for tick in range(10):
-        reader.receive(0.01 * tick, imu.encode(tick, quat_of(100 * (tick > 0), 0, 0)))
+        reader.receive(0.01 * tick, imu.encode(tick, quat_of(100 * (tick > 0))))
     reader.calibrate(IDENTITY)
     assert not reader.jumped and reader.read()[0] == pytest.approx(0.09)
 
@@ -163,12 +202,12 @@ def test_the_imu_thread_reads_a_port():
     part = imu.Imu(os.ttyname(slave))  # Its z along the object's x.
     with pytest.raises(HandError, match="UART-RVC"):
         part.wait(0.05)
-    os.write(master, imu.encode(0, quat_of(40, 0, 0)))
+    os.write(master, imu.encode(0, quat_of(40)))
     part.wait()
     part.calibrate(IDENTITY)
     assert apart(part.read()[1], IDENTITY) < 2e-3
     for index in range(1, 31):
-        os.write(master, b"\x00\xaa" + imu.encode(index, quat_of(40 + index, 0, 0)))
+        os.write(master, b"\x00\xaa" + imu.encode(index, quat_of(40 + index)))
     until = time.monotonic() + 20
     while apart(part.read()[1], IDENTITY) < 0.52 and time.monotonic() < until:
         time.sleep(0.01)

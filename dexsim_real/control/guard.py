@@ -1,6 +1,6 @@
 """A second process that turns the motors off when the runner dies or freezes, whatever killed or stopped it.
 
-    python -m dexsim_real.run.guard PORT LINK HAND
+    python -m dexsim_real.control.guard PORT LINK HAND
 
 `python -m dexsim_real.run` starts it. A pipe connects the two. While the motors may be on, the exchange thread writes
 signs of life to it, each with the seconds until the next one; the kernel closes it at the runner's death, even by
@@ -53,7 +53,7 @@ class Guard:
     def __init__(self, port: str, link: LinkConfig, hand: Hand):
         root = str(Path(__file__).resolve().parents[2])
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "dexsim_real.run.guard", port, json.dumps(dataclasses.asdict(link)), hand.source],
+            [sys.executable, "-m", __name__, port, json.dumps(dataclasses.asdict(link)), hand.source],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -93,7 +93,7 @@ class Guard:
         """Raises HandError: the process has ended, or is suspended."""
         if self._process.poll() is not None:
             raise HandError("the guard process has ended")
-        if self._answered(0.0):
+        if self._armed and self._answered(0.0):  # `arm` waits for the first answer.
             self._asked = None
         late = self._asked is not None and time.monotonic() - self._asked > _ANSWER
         if late and not self._answered(_MOMENT):
