@@ -9,8 +9,9 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
-from dexsim.calibration.line import LEAST_PRESSES, jackknife
+from dexsim.calibration.line import LEAST_PRESSES
 from dexsim.calibration.signals import check_signals
 from dexsim.core.errors import CalibrationError
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
@@ -184,9 +185,9 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
-    The widest of three intervals counts: that of independent residuals, and jackknives over the segments and over equal
-    stretches of time. What the model gets wrong differs from signal to signal, and residuals that follow each other go
-    together.
+    The widest of three intervals counts: that of independent residuals, and those of residuals that go together in the
+    segments, and in equal stretches of time. What the model gets wrong differs from signal to signal, and residuals
+    that follow each other go together.
 
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
@@ -197,24 +198,36 @@ def uncertainty(
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
       directions [P] as boolean masks of their members.
     """
-    relative = jacobian * size
-    _, singular, right = np.linalg.svd(relative, full_matrices=False)
+    left, singular, right = np.linalg.svd(jacobian * size, full_matrices=False)
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
-    inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    covariance = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
+    basis, solution = left[:, determined], right[determined].T / singular[determined]  # [N, D], [P, D]
+    covariance = solution @ solution.T * np.sum(residual**2) / max(len(residual) - len(size), 1)
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     half = _NORMAL * spread
     for group in (segment, np.arange(len(segment)) * _PARTS // len(segment)):
-        if len(np.unique(group)) >= LEAST_PRESSES:
-            own = np.tile(group, len(residual) // len(group))
-            half = np.maximum(half, jackknife(relative, relative, residual, own))
+        own = np.tile(group, len(residual) // len(group)) == np.unique(group)[:, None]
+        if len(own) >= LEAST_PRESSES:
+            moved = np.array([_influence(basis[rows], residual[rows]) for rows in own]) @ solution.T
+            half = np.maximum(half, stdtrit(len(own) - 1, 0.975) * np.linalg.norm(moved, axis=0))
     half = half * size
     correlation = covariance / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
+
+
+def _influence(basis: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """How a group of residuals [n] moves a fit [D], by its rows [n, D] of the orthonormal basis of all residuals.
+
+    A fit follows the group that shows a parameter best, which makes that group's residuals too small. The root of the
+    share that other groups have in each direction corrects this (CR2 of Bell and McCaffrey 2002). A jackknife divides
+    by the share itself, and explodes where one group has nearly all of it: the place of a dead-band's edge, say.
+    """
+    share, axes = np.linalg.eigh(basis.T @ basis)
+    weight = np.where(share < 1 - 1e-6, 1 / np.sqrt(np.maximum(1 - share, 1e-6)), 0.0)  # 1: a start of its own
+    return axes @ (weight * (axes.T @ (basis.T @ residual)))
 
 
 def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> float:
