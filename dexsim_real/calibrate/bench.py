@@ -257,11 +257,10 @@ class Bench(ExchangeLoop):
         if error is None and self.log.losses:
             raise HandError(self.log.losses)
 
-    def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> HandSample | None:
+    def step(self, target: np.ndarray | None = None) -> HandSample | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
 
-        `target` [J] rad are the requested joint targets, None keeps the last ones; `mark` is the annotation with which
-        a sample is logged.
+        `target` [J] rad are the requested joint targets, None keeps the last ones.
 
         Raises HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
         """
@@ -273,11 +272,7 @@ class Bench(ExchangeLoop):
         self._newest = {"sent": now, "command": self.command.tobytes(), "answer": answer}
         self._check(now, sample)
         self.pace.wait()
-        if sample is None or self.safety.problem:
-            return None
-        if mark:
-            self.annotate(mark)
-        return sample
+        return None if self.safety.problem else sample
 
     def annotate(self, mark: dict[str, Any]) -> None:
         """Log the newest exchange with an annotation."""
@@ -286,11 +281,13 @@ class Bench(ExchangeLoop):
     def collect(
         self, seconds: float, target: np.ndarray | None = None, mark: dict[str, Any] | None = None
     ) -> list[HandSample]:
-        """The samples of this duration in s; arguments and errors as for `step`, or there is none."""
+        """The samples of this duration in s, logged with this annotation; errors as for `step`, or there is none."""
         until, samples = self.clock() + seconds, list[HandSample]()
         while self.clock() < until:
-            if (sample := self.step(target, mark)) is not None:
+            if (sample := self.step(target)) is not None:
                 samples.append(sample)
+                if mark:
+                    self.annotate(mark)
         if not samples:
             raise HandError(f"no usable answer in {seconds:g} s; check the cable")
         return samples
@@ -361,20 +358,16 @@ def read_logs(paths: Iterable[Path], task: str) -> tuple[Source, list[list[Recor
     """
     sources, logs = list[Source](), []
     for path in paths:
-        records = []
         with reading(path):
-            for record in LogReader(path):
-                content = record.content
-                if record.kind == Kind.META and "task" in content:
-                    if content["task"] != task:
-                        raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
-                    hardware = from_dict(HardwareConfig, content["hardware"])
-                    sources.append(Source(hardware, content["rate"], Identity(*content["identity"])))
-                elif record.kind in (Kind.META, Kind.TICK):
-                    records.append(record)
+            records = [record for record in LogReader(path) if record.kind in (Kind.META, Kind.TICK)]
+            if not records:
+                raise LogError(f"{path}: the log ends before the hand was ready; record again")
+            meta = records.pop(0).content
+            if meta["task"] != task:
+                raise LogError(f"{path}: this is a log of {meta['task']!r}; give one of {task!r}")
+            hardware = from_dict(HardwareConfig, meta["hardware"])
+            sources.append(Source(hardware, meta["rate"], Identity(*meta["identity"])))
         logs.append(records)
-        if len(sources) < len(logs):
-            raise LogError(f"{path}: the log ends before the hand was ready; record again")
         for what, own, first in zip(("--hardware options", "--rate", "hand"), sources[-1], sources[0], strict=True):
             if own != first:
                 raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")

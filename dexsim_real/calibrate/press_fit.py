@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, correlate, median_filter
 
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
@@ -30,7 +29,7 @@ from dexsim_real.calibrate.bench import Source, read_logs
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING
 from dexsim_real.core.log import Kind, Record
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.taxels import taxel_names
+from dexsim_real.sensors.taxels import around, taxel_names
 
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
 _LEVER = 0.002  # m, 95 %, between the contact and the centre of the taxels' forces
@@ -42,7 +41,6 @@ _SHEAR = 0.1  # share of the force above which shear is noted
 _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
 
 _ACTIVE = 2.0  # counts above which a taxel takes part
-_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)  # the neighbours of a taxel
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
 _GAUGE = 0.03  # of the gauge itself, and of how straight it stands under a fingertip that turns by up to 0.25 rad
@@ -85,9 +83,8 @@ def read_presses(paths: Iterable[Path], hand: Hand) -> tuple[Source, dict[str, R
     source, logs = read_logs(paths, "calibrate")
     recordings: dict[str, Recording] = {}
     for records in logs:
-        for press in _presses(source, records, hand):
-            if press.finished or press.name not in recordings:
-                recordings[press.name] = press
+        own = _presses(source, records, hand)
+        recordings |= {press.name: press for press in own if press.finished or press.name not in recordings}
     return source, recordings
 
 
@@ -118,14 +115,8 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recordin
     recordings = []
     for name, (placement, gauge, samples) in presses.items():
         if samples:
-            recording = Recording(
-                name,
-                placement["finger"],
-                tuple(placement["joints"]),
-                source.rate,
-                gauge,
-                *(np.array(column) for column in zip(*samples, strict=True)),
-            )
+            columns = map(np.array, zip(*samples, strict=True))
+            recording = Recording(name, placement["finger"], tuple(placement["joints"]), source.rate, gauge, *columns)
             recording.shear -= zero[recording.finger]
             recordings.append(recording)
     return recordings
@@ -168,40 +159,26 @@ def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tupl
 
     Raises CalibrationError: recordings are missing or unusable.
     """
-    blocks, notes = {}, list[str]()
-    for name, recording in recordings.items():
-        if not recording.at(LOADING, UNLOADING).any():
-            continue
-        part = make_blocks(recording, hand)
-        if part.counts.sum() > 0:
-            blocks[name] = part
-        else:  # Without force no lever arm.
-            notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
+    loaded = {name: recording for name, recording in recordings.items() if recording.at(LOADING, UNLOADING).any()}
+    blocks, notes = {name: make_blocks(recording, hand) for name, recording in loaded.items()}, list[str]()
+    for name in [name for name, part in blocks.items() if not part.counts.any()]:  # Without force no lever arm.
+        notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
+        del blocks[name]
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
-    per_count, scales, scale_notes = force_scale(source, hand, [recordings[name] for name in blocks])
+    per_count, scales = force_scale(source, hand, [loaded[name] for name in blocks], notes)
     joints = dict[str, JointFit]()
     for name, part in blocks.items():
-        for label, found in _press(hand, recordings[name], part, scales[name], notes).items():
+        for label, found in _press(hand, loaded[name], part, scales[name], notes).items():
             if label not in joints or found.lever > joints[label].lever:
                 joints[label] = found
+    real, sim = ({label: getattr(found, side) for label, found in joints.items()} for side in ("real", "sim"))
     try:
-        calibration = calibrate(
-            hand,
-            {label: found.real for label, found in joints.items()},
-            {label: found.sim for label, found in joints.items()},
-            force_per_count=per_count,
-            serial=source.identity.serial_number,
-            handedness=source.identity.handedness,
-        )
+        calibration = calibrate(hand, real, sim, per_count, *source.identity)
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from None
-    calibration = dataclasses.replace(
-        calibration,
-        force_per_torque=_force_per_torque(hand, calibration, joints),
-        notes=(*calibration.notes, *scale_notes, *notes),
-    )
-    return calibration, joints
+    ratio, notes = _force_per_torque(hand, calibration, joints), [*calibration.notes, *notes]
+    return dataclasses.replace(calibration, force_per_torque=ratio, notes=tuple(notes)), joints
 
 
 def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: list[str]) -> dict[str, JointFit]:
@@ -257,22 +234,21 @@ def make_blocks(recording: Recording, hand: Hand) -> Blocks:
     Raises CalibrationError: no phase is long enough.
     """
     size, phase = max(round(_BLOCK * recording.rate), 1), recording.phase
-    runs, presses, before = list[np.ndarray](), list[int](), UNLOADING  # rows [blocks, size] of each, and its press
-    for rows in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
-        blocks = len(rows) // size
-        if phase[rows[0]] in (LOADING, UNLOADING) and blocks > 1:  # A single block has no speed.
-            begins = before == UNLOADING and phase[rows[0]] == LOADING
-            presses.append((presses[-1] if presses else 0) + begins)
-            runs.append(rows[: blocks * size].reshape(blocks, size))
-            before = phase[rows[0]]
+    runs = [
+        rows[: len(rows) // size * size].reshape(-1, size)
+        for rows in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1)
+        if phase[rows[0]] in (LOADING, UNLOADING) and len(rows) >= 2 * size  # A single block has no speed.
+    ]
     if not runs:
         raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
     time, angle = recording.time, recording.position
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
+    rows, loading = np.concatenate(runs), phase == LOADING
     parts = (recording.counts, recording.shear, recording.current, angle)
-    counts, shear, current, position = (part[np.concatenate(runs)].mean(1) for part in parts)
-    run, press = (np.repeat(number, [len(run) for run in runs]) for number in (range(len(runs)), presses))
+    counts, shear, current, position = (part[rows].mean(1) for part in parts)
+    run = np.repeat(range(len(runs)), [len(run) for run in runs])
+    press = np.cumsum(np.diff(loading, prepend=False) & loading)[rows[:, 0]]
     return Blocks(counts * active_taxels(hand, counts), shear, current, position, speed, run, press)
 
 
@@ -322,16 +298,14 @@ def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str,
 
 
 def force_scale(
-    source: Source, hand: Hand, pressed: Iterable[Recording]
-) -> tuple[np.ndarray, dict[str, Scale], list[str]]:
-    """Compare the taxels with the gauge. A press without readings uses those of the finger's other press.
+    source: Source, hand: Hand, pressed: Iterable[Recording], notes: list[str]
+) -> tuple[np.ndarray, dict[str, Scale]]:
+    """Newtons of a count [F] for a run, and the scale of each press, by the gauge; adds notes.
 
-    Returns:
-      Newtons of a count [F] for a run, the scale of each press, and notes.
-
-    Raises CalibrationError: the readings do not rise with the force.
+    A press without readings uses those of the finger's other press. Raises CalibrationError: the readings do not rise
+    with the force.
     """
-    own, scales, notes = dict[int, float](), dict[str, Scale](), list[str]()  # `own` by finger: N per count
+    own, scales = dict[int, float](), dict[str, Scale]()  # `own` by finger: N per count
     pressed = sorted(pressed, key=lambda press: not press.name.endswith("pad"))
     for press in pressed:
         levels = {level: press.at(level) for level in press.gauge if press.at(level).any()}
@@ -364,25 +338,24 @@ def force_scale(
     for press in pressed:
         error = _PLACE if press.finger in own else _OTHERS if own else _NOMINAL
         scales.setdefault(press.name, Scale(float(per_count[press.finger]), 0.0, error))
-    return per_count, scales, notes
+    return per_count, scales
 
 
 def active_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
     """Mask [N] of the taxels that take part in counts [T, N] of a press, and of those beside them."""
-    active = (counts.max(0) >= _ACTIVE).reshape(hand.taxel_grid)
-    return binary_dilation(active, np.ones((3, 3))).ravel()
+    active = counts.max(0, keepdims=True) >= _ACTIVE
+    return (active | around(hand, active).any(0))[0]
 
 
 def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
     """Mask [N] of taxels that read nothing in counts [T, N] of a press, although half of their neighbours did."""
-    largest = counts.max(0).reshape(hand.taxel_grid)
-    return ((largest <= 0) & (median_filter(largest, footprint=_RING) >= _ACTIVE)).ravel()
+    largest = counts.max(0, keepdims=True)
+    pressed, beside = around(hand, largest >= _ACTIVE).sum(0), around(hand, np.ones(largest.shape)).sum(0)
+    return ((largest <= 0) & (pressed >= beside / 2))[0]
 
 
 def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
     """Counts [T, N] in which a dead taxel has the mean of its working neighbours."""
-    grid = (-1, *hand.taxel_grid)
-    ring, working = _RING[None].astype(float), np.where(dead, 0.0, 1.0)
-    total = correlate((counts * working).reshape(grid), ring, mode="constant")
-    near = correlate(working.reshape(grid), ring, mode="constant")
-    return np.where(dead, (total / np.maximum(near, 1)).reshape(counts.shape), counts)
+    working = np.where(dead, 0.0, 1.0)[None]
+    total, near = around(hand, counts * working).sum(0), around(hand, working).sum(0)
+    return np.where(dead, total / np.maximum(near, 1), counts)

@@ -209,7 +209,7 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
     covariance = np.linalg.inv(jacobian.T @ jacobian) * np.sum(residual**2) / 397
     spread = np.sqrt(np.diag(covariance))
     assert np.all(half / 1.96 >= 0.999 * spread)
-    np.testing.assert_allclose(half / 1.96, spread, rtol=0.5)  # The jackknife's own scatter.
+    np.testing.assert_allclose(half / 1.96, spread, rtol=0.5)  # Twenty stretches scatter.
     np.testing.assert_allclose(correlation, covariance / np.outer(spread, spread), atol=1e-9)
     assert not null
     twin = np.column_stack([jacobian, jacobian[:, 1]])
