@@ -141,11 +141,13 @@ class Operator:
         """Print one line."""
         print(text, file=self.out, flush=True)
 
-    def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
-        """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.
+    def ask(self, text: str, meanwhile: Callable[[], object]) -> str | None:
+        """Ask a question; returns the stripped answer, None for an s. `meanwhile` is called until it arrives.
 
         Raises HandError: the input is closed.
         """
+        if self.assume_yes:
+            return ""
         if self._stream.isatty():
             termios.tcflush(self._stream, termios.TCIFLUSH)  # Discard keys pressed before the question.
         self.tell(text)
@@ -161,13 +163,13 @@ class Operator:
             meanwhile()
         if not lines[-1]:
             raise HandError("standard input is closed; run in a terminal, or give --yes")
-        return lines[-1].strip()
+        return None if (answer := lines[-1].strip()).lower() in ("s", "skip", "stop") else answer
 
     def ask_force(self, meanwhile: Callable[[], object]) -> float | None:
         """Ask for the reading of the gauge in N until it is one; None when the user skips it."""
         while True:
             text = self.ask("  reading of the gauge (newtons, or a number with g or kg; s skips):", meanwhile)
-            if text.lower() in ("s", "skip"):
+            if text is None:
                 return None
             try:
                 return parse_reading(text)

@@ -31,6 +31,9 @@ from dexsim_real.core.log import Kind, Record
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.taxels import around, taxel_names
 
+Scale = tuple[float, float, float]
+"""Of a press's taxel counts: N per count, N without counts, and the share (95 %) by which the first may be wrong."""
+
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
 _LEVER = 0.002  # m, 95 %, between the contact and the centre of the taxels' forces
 _HEAT = 0.02  # share, 95 %: magnets lose 0.1 % per K, and the windings' temperature is not known
@@ -128,21 +131,14 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recordin
 class Blocks(NamedTuple):
     """A press averaged over B blocks of a quarter of a second."""
 
-    counts: np.ndarray  # [B, N] of the taxels that take part, 0 of the others
+    counts: np.ndarray  # [B, N], as `repaired`
+    dead: np.ndarray  # [N] bool, taxels
     shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
     current: np.ndarray  # [B, J] A
     position: np.ndarray  # [B, J] rad
     speed: np.ndarray  # [B, J] rad/s
     run: np.ndarray  # [B] number of the loading or unloading phase
     press: np.ndarray  # [B] number of the press, up and down
-
-
-class Scale(NamedTuple):
-    """Newtons of a press's taxel counts: gain * counts + offset."""
-
-    gain: float
-    offset: float
-    error: float  # share of the gain, 95 %
 
 
 class JointFit(NamedTuple):
@@ -183,11 +179,9 @@ def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tupl
 
 def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: list[str]) -> dict[str, JointFit]:
     """What one press says of each of its joints; of what it does not, it adds notes."""
-    name, finger = recording.name, recording.finger
-    dead = dead_taxels(hand, part.counts)
-    counts = fill_dead(hand, part.counts, dead)
+    name, finger, counts, (per_count, offset, error) = recording.name, recording.finger, part.counts, scale
     sums = counts.sum(-1)
-    force = sums * scale.gain + scale.offset
+    force = sums * per_count + offset
     # All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
     # fingertip is the sum over its taxels, as in simulation.
     shares = counts / np.maximum(sums, 1e-9)[:, None]
@@ -213,11 +207,11 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
             notes.append(f"{label}: hardly moved while the {name} was pressed; press on something softer, more often")
             continue
         # A force read too large makes the gain of the current too small, and leaves the lever arm.
-        known, placed = float(np.hypot(scale.error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
+        known, placed = float(np.hypot(error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
         real = JointPress(force, part.current[:, joint], way, part.press, known)
         fits[label] = JointFit(name, arm, real, JointPress(force, force * arms[:, joint], way, part.press, placed))
-    if dead.any():
-        which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, dead)}"
+    if part.dead.any():
+        which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, part.dead)}"
         notes.append(f"{which} read nothing while their neighbours were pressed; the fit uses the neighbours' mean")
     if shear > _SHEAR:
         notes.append(f"{name}: shear of {100 * shear:.0f} % of the force, ignored by the fit; press on what rolls")
@@ -249,7 +243,7 @@ def make_blocks(recording: Recording, hand: Hand) -> Blocks:
     counts, shear, current, position = (part[rows].mean(1) for part in parts)
     run = np.repeat(range(len(runs)), [len(run) for run in runs])
     press = np.cumsum(np.diff(loading, prepend=False) & loading)[rows[:, 0]]
-    return Blocks(counts * active_taxels(hand, counts), shear, current, position, speed, run, press)
+    return Blocks(*repaired(hand, counts), shear, current, position, speed, run, press)
 
 
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
@@ -313,10 +307,7 @@ def force_scale(
             if levels:
                 notes.append(f"{press.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        counts = np.array([press.counts[rows].mean(0) for rows in levels.values()])
-        counts = counts * active_taxels(hand, counts)
-        # The fit applies this gain to sums with the dead taxels filled in.
-        counts = fill_dead(hand, counts, dead_taxels(hand, counts))
+        counts, _ = repaired(hand, np.array([press.counts[rows].mean(0) for rows in levels.values()]))
         gauge = np.array([press.gauge[level] for level in levels])
         if np.ptp(gauge) <= 0:
             raise CalibrationError(f"{press.name}, gauge: all readings are {gauge[0]:g} N")
@@ -324,7 +315,7 @@ def force_scale(
         if line.gain <= line.gain_error:
             raise CalibrationError(f"{press.name}, gauge: counts do not follow its readings ({line.gain:.3g} per N)")
         error = float(np.hypot(line.gain_error / line.gain, _GAUGE))
-        scales[press.name] = Scale(1.0 / line.gain, -line.offset / line.gain, error)
+        scales[press.name] = 1.0 / line.gain, -line.offset / line.gain, error
         found = f"{line.gain:.3g} +- {line.gain * np.hypot(error, _PLACE):.2g} counts per newton by the gauge"
         notes.append(f"{press.name}: {found} ({len(gauge)} readings), {line.offset:.1f} counts at zero force")
         own.setdefault(press.finger, 1.0 / line.gain)
@@ -337,25 +328,17 @@ def force_scale(
             notes.append(f"{name}: not compared with the gauge; has the others' mean (up to {100 * _OTHERS:.0f} % off)")
     for press in pressed:
         error = _PLACE if press.finger in own else _OTHERS if own else _NOMINAL
-        scales.setdefault(press.name, Scale(float(per_count[press.finger]), 0.0, error))
+        scales.setdefault(press.name, (float(per_count[press.finger]), 0.0, error))
     return per_count, scales
 
 
-def active_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [N] of the taxels that take part in counts [T, N] of a press, and of those beside them."""
-    active = counts.max(0, keepdims=True) >= _ACTIVE
-    return (active | around(hand, active).any(0))[0]
-
-
-def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [N] of taxels that read nothing in counts [T, N] of a press, although half of their neighbours did."""
+def repaired(hand: Hand, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Counts [T, N] of a press, and the mask [N] of dead taxels, which read nothing although half of their neighbours
+    did: they get the mean of their working neighbours. What reads next to nothing far from the press becomes 0."""
     largest = counts.max(0, keepdims=True)
-    pressed, beside = around(hand, largest >= _ACTIVE).sum(0), around(hand, np.ones(largest.shape)).sum(0)
-    return ((largest <= 0) & (pressed >= beside / 2))[0]
-
-
-def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
-    """Counts [T, N] in which a dead taxel has the mean of its working neighbours."""
-    working = np.where(dead, 0.0, 1.0)[None]
+    pressed, beside = largest >= _ACTIVE, around(hand, largest >= _ACTIVE)
+    dead = (largest <= 0) & (beside.sum(0) >= around(hand, np.ones(largest.shape)).sum(0) / 2)
+    working = np.where(dead, 0.0, 1.0)
     total, near = around(hand, counts * working).sum(0), around(hand, working).sum(0)
-    return np.where(dead, total / np.maximum(near, 1), counts)
+    filled = np.where(dead, total / np.maximum(near, 1), counts)
+    return np.where(pressed | beside.any(0), filled, 0.0), dead[0]

@@ -152,10 +152,8 @@ class PressProcedure:
         self._placement = placement
         self._start()
         self.operator.tell(f"{placement.name}: hold {placement.task}")
-        if not self.operator.assume_yes:
-            answer = self.operator.ask("  Enter presses, s skips:", lambda: self.bench.step(self._target()))
-            if answer.lower() in ("s", "skip"):
-                return False
+        if self.operator.ask("  Enter presses, s skips:", lambda: self.bench.step(self._target())) is None:
+            return False
         self._tare_in_air()
         self._approach()
         speed = self.config.first_speed
