@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from dexsim.calibration.line import LEAST_PRESSES, Line, fit_line
-from dexsim.calibration.maps import Calibration, Side, check_plausible
+from dexsim.calibration.maps import Calibration, Side, blank_calibration, check_plausible
 from dexsim.calibration.signals import check_signals, find_swings
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.description import Hand
@@ -42,7 +42,6 @@ def calibrate(
     hand: Hand,
     real: Mapping[str, JointPress],
     sim: Mapping[str, JointPress],
-    *,
     force_per_count: float | np.ndarray = 0.1,
     serial: str = "",
     handedness: str = "",
@@ -70,14 +69,11 @@ def calibrate(
         sides[unit] = _complete(hand, fits, where)
     if absent := [name for joint, name in enumerate(hand.joint_names) if joint not in pressed]:
         notes.append(f"{', '.join(absent)}: not pressed, mean of the joints of its torque limit, not to be trusted")
-    calibration = Calibration(
-        sides["A"],
-        sides["Nm"],
-        np.round(np.asarray(hand.torque_limit, float), 6),
-        np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy(),
-        hand=hand.name,
-        joint_names=hand.joint_names,
-        finger_names=hand.finger_names,
+    calibration = dataclasses.replace(
+        blank_calibration(hand),
+        real=sides["A"],
+        sim=sides["Nm"],
+        force_per_count=np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy(),
         serial=serial,
         handedness=handedness,
         created=datetime.date.today().isoformat(),
@@ -127,7 +123,6 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> tuple[S
     signals = {"force": (press.force, "N"), "value": (press.value, unit)}
     check_signals(where, MIN_SAMPLES, signals, _SATURATED)
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
-    _check_range(force, where)
     direction, number = find_swings(force)
     if press.direction is not None:
         direction = np.sign(np.asarray(press.direction))
@@ -139,7 +134,10 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> tuple[S
         if len(keep) < MIN_SAMPLES:
             lines.append(None)
             continue
-        _check_range(force[keep], f"{where}, {name}")
+        low, high = np.quantile(force[keep], [0.05, 0.95])
+        if high - low < MIN_FORCE_RANGE:
+            stays = f"force stays between {low:.3g} and {high:.3g} N"
+            raise CalibrationError(f"{where}, {name}: {stays}: press over at least {MIN_FORCE_RANGE} N")
         line = fit_line(force[keep], value[keep], number[keep])
         if abs(line.gain) <= line.gain_error:
             raise CalibrationError(
@@ -177,10 +175,3 @@ def _doubts(line: Line, which: str) -> list[str]:
         f"{which}: R2 {line.r_squared:.2f}: hardly a line": line.r_squared < 0.9,
     }
     return [note for note, doubtful in notes.items() if doubtful]
-
-
-def _check_range(force: np.ndarray, where: str) -> None:
-    low, high = np.quantile(force, [0.05, 0.95])
-    if high - low < MIN_FORCE_RANGE:
-        stays = f"force stays between {low:.3g} and {high:.3g} N"
-        raise CalibrationError(f"{where}: {stays}: press over at least {MIN_FORCE_RANGE} N")

@@ -53,6 +53,7 @@ class Calibration:
     sim: Side  # Nm against N
     torque_scale: Array  # [J] Nm that read as 1: the hand's torque limits, as in `Env`
     force_per_count: Array  # [F] N
+    force_per_torque: Array  # [3, F] N/Nm at the root joint: value, 95 % low, high; 0: not pressed
     hand: str = static()
     joint_names: tuple[str, ...] = static()
     finger_names: tuple[str, ...] = static()
@@ -60,29 +61,23 @@ class Calibration:
     handedness: str = static(default="")  # likewise
     created: str = static(default="")
     notes: tuple[str, ...] = static(default=())
-    force_per_torque: Array | None = None  # [3, F] N/Nm at the root joint: value, 95 % low, high; 0: not pressed
 
 
 def blank_calibration(hand: Hand) -> Calibration:
     """A template of a hand's calibration: every measured number is NaN, which `load_calibration` refuses."""
-    side = Side(**{name: np.full(shape, np.nan) for name, shape in _shapes(hand.num_joints).items()})
+    lines, joint = np.full((2, hand.num_joints), np.nan), np.full(hand.num_joints, np.nan)
+    side = Side(lines, lines, lines, lines, lines, joint, joint, joint)
     return Calibration(
-        real=side,
-        sim=side,
-        torque_scale=hand.torque_limit,
-        force_per_count=np.full(hand.num_fingers, np.nan),
+        side,
+        side,
+        np.round(np.asarray(hand.torque_limit, float), 6),
+        np.full(hand.num_fingers, np.nan),
+        np.zeros((3, hand.num_fingers)),
         hand=hand.name,
         joint_names=hand.joint_names,
         finger_names=hand.finger_names,
         notes=("a template: fill it with dexsim calibrate",),
     )
-
-
-def _shapes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of a `Side`."""
-    single = ("friction", "value_max", "force_max")
-    names = [field.name for field in dataclasses.fields(Side)]
-    return {name: (joints,) if name in single else (2, joints) for name in names}
 
 
 # --- run time -------------------------------------------------------------------------------
@@ -116,14 +111,6 @@ def taxel_force(calibration: Calibration, counts: jax.Array) -> jax.Array:
     return jnp.maximum(counts * align(scale, counts), 0.0)
 
 
-def normalise(side: Side, joint: int, force: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Force and |value| of one joint's recording over their maxima: the paper's [0, 1] axes."""
-    return (
-        np.asarray(force) / float(side.force_max[joint]),
-        np.asarray(value) * np.sign(float(side.gain[0, joint])) / float(side.value_max[joint]),
-    )
-
-
 def torque_constants(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
     """Torque constants [2, J] Nm/A at the joint, loading and unloading, and half of their 95 % intervals [2, J]."""
     real, sim = calibration.real, calibration.sim
@@ -138,7 +125,7 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
     The first finger, the thumb, keeps its own: in a grasp its root joint also bears what lies on its links, which a
     press does not show.
     """
-    if calibration is None or calibration.force_per_torque is None:
+    if calibration is None or not np.any(calibration.force_per_torque):
         return hand
     calibrated = np.array(calibration.force_per_torque, np.float32)[0]
     calibrated[0] = 0.0
@@ -162,8 +149,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}"]
     lines += [f"{name} = {json.dumps(getattr(calibration, name), ensure_ascii=False)}" for name in _WORDS]
-    numbers = {name: getattr(calibration, name) for name in _UNITS}
-    lines += [f"{name} = {_text(value)}  # {_UNITS[name]}" for name, value in numbers.items() if value is not None]
+    lines += [f"{name} = {_text(getattr(calibration, name))}  # {unit}" for name, unit in _UNITS.items()]
     lines.append(_SIDES)
     for name, side in (("real", calibration.real), ("sim", calibration.sim)):
         lines += [f"[{name}]", *(f"{field} = {_text(values)}" for field, values in vars(side).items())]
@@ -177,74 +163,56 @@ def _text(values: Any) -> str:
     return str(np.asarray(values, float).tolist())  # Unlike JSON's, Python's nan and inf are TOML's.
 
 
-def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
-    """Read a calibration.
-
-    Args:
-      path: written by `save_calibration`.
-      hand: if given, the hand that it must belong to.
+def load_calibration(path: str | Path, hand: Hand) -> Calibration:
+    """Read the calibration of this hand, written by `save_calibration`.
 
     Raises:
       CalibrationError: missing, cut, not a calibration, of another version or hand, or with a number that no hand
         gives.
     """
     try:
-        calibration = _calibration(read_toml(Path(path)))
+        calibration = _calibration(read_toml(Path(path)), hand)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         what = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration file ({what:.100})") from None
-    own = calibration.hand, calibration.joint_names, calibration.finger_names
-    if hand is not None and own != (hand.name, hand.joint_names, hand.finger_names):
-        raise CalibrationError(
-            f"{path}: is of hand {calibration.hand!r:.60} with {len(own[1])} joints and {len(own[2])} fingers, not of "
-            f"{hand.name!r} or its joints or fingers: calibrate this hand"
-        )
+        raise CalibrationError(f"{path}: damaged, cut off, or not a calibration of this hand ({what:.130})") from None
     check_plausible(path, calibration, hand)
     return calibration
 
 
-def _calibration(table: dict[str, Any]) -> Calibration:
+def _calibration(table: dict[str, Any], hand: Hand) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
-    kind, version = table.pop("format"), table.pop("version")
-    if kind != FORMAT or version != VERSION:
-        raise ValueError(f"expected version {VERSION}, got {version!r:.20}")
-    words: dict[str, Any] = {
-        name: tuple(map(str, v)) if isinstance(v := table.pop(name), list) else str(v) for name in _WORDS
-    }
-    joints, fingers = len(words["joint_names"]), len(words["finger_names"])
-
-    def numbers(part: dict[str, Any], shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-        if unknown := set(part) - set(shapes):
-            raise ValueError(f"unknown entry {min(unknown)!r}")
-        arrays = {name: np.array(part[name], float) for name in shapes}
-        for name, shape in shapes.items():
-            if arrays[name].shape != shape:
-                raise ValueError(f"{name!r} must hold {' x '.join(map(str, shape))} numbers")
-        return arrays
-
-    real, sim = (Side(**numbers(table.pop(name), _shapes(joints))) for name in ("real", "sim"))
-    shapes: dict[str, tuple[int, ...]] = {"torque_scale": (joints,), "force_per_count": (fingers,)}
-    if "force_per_torque" in table:
-        shapes["force_per_torque"] = 3, fingers
-    arrays: dict[str, Any] = numbers(table, shapes)
-    return Calibration(real, sim, **arrays, **words)
+    own = {"hand": hand.name, "joint_names": hand.joint_names, "finger_names": hand.finger_names}
+    for name, expected in ({"format": FORMAT, "version": VERSION} | own).items():
+        found = table.pop(name)
+        if (tuple(found) if isinstance(found, list) else found) != expected:
+            raise ValueError(f"expected {name} {expected!r:.40}, got {found!r:.40}")
+    words: dict[str, Any] = {name: str(table.pop(name)) for name in ("serial", "handedness", "created")}
+    notes = tuple(map(str, table.pop("notes")))
+    for side in ("real", "sim"):
+        table[side] = Side(**{name: np.array(values, float) for name, values in dict(table[side]).items()})
+    numbers: dict[str, Any] = {name: np.array(table.pop(name), float) for name in _UNITS}
+    calibration = Calibration(**table, **numbers, **own, **words, notes=notes)
+    blank = jax.tree.leaves(blank_calibration(hand))
+    for (field, values), template in zip(jax.tree_util.tree_leaves_with_path(calibration), blank, strict=True):
+        if values.shape != template.shape:
+            raise ValueError(f"{jax.tree_util.keystr(field)} must hold {' x '.join(map(str, template.shape))} numbers")
+    return calibration
 
 
 # --- what no hand gives -----------------------------------------------------------------------
 
 
 @np.errstate(all="ignore")  # What overflows is out of its range.
-def check_plausible(where: object, calibration: Calibration, hand: Hand | None = None) -> None:
+def check_plausible(where: object, calibration: Calibration, hand: Hand) -> None:
     """Check every number that a run uses: a wrong torque from a file would drive the motors wrongly.
 
     The ranges are far from the values of a good hand: a wrong unit is found, an unusual hand is no error.
 
     Args:
       where: named in errors.
-      calibration: its arrays have the right shapes.
-      hand: the hand that it is of, if known.
+      calibration: of this hand, with arrays of the right shapes.
 
     Raises:
       CalibrationError: names the joint or finger, the quantity, its value and its range.
@@ -254,7 +222,7 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand | None =
     # `joint_torque` takes the middle of the lines; of the hand's both are checked, so their mean is as good.
     per_ampere = np.mean(sim.gain, 0) / np.asarray(real.gain)  # [2, J] Nm/A
     idle = np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)  # [2, J] Nm
-    force = np.zeros(0) if calibration.force_per_torque is None else np.asarray(calibration.force_per_torque)[0]
+    force = np.asarray(calibration.force_per_torque)[0]
     ranges: tuple[tuple[tuple[str, ...], str, Any, float, float, str], ...] = (
         # The maker's is 0.1 N. Below 1 mN all 120 taxels, saturated at 255 counts, read 31 N together: less than the
         # 37 N of 1.1 Nm at a lever of 0.03 m. Above 1 N one saturated taxel reads three times what the hand gives.
@@ -262,7 +230,7 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand | None =
         # A fingertip is 0.3 m to 1 mm from its root joint's axis; 0: not pressed.
         (fingers, "force_per_torque", np.where(force == 0, 10.0, force), 1 / 0.3, 1e3, "N/Nm"),
         (joints, "torque_scale", scale, 0.01, 20.0, "Nm"),  # finger motors stall at 0.4 and 1.1 Nm
-        (joints, "torque_scale over the hand's limit", scale / (hand.torque_limit if hand else scale), 0.99, 1.01, ""),
+        (joints, "torque_scale over the hand's limit", scale / hand.torque_limit, 0.99, 1.01, ""),
         (joints, "magnitude of sim.gain", np.abs(sim.gain), 1e-4, 0.3, "Nm/N"),  # a finger is 0.1 m long
         (joints, "sim.gain unloading over loading", sim.gain[1] / sim.gain[0], 1e-4, 1e4, ""),
         (joints, "real.gain unloading over loading", real.gain[1] / real.gain[0], 1e-4, 1e4, ""),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.calibration.fit import JointPress
-from dexsim.calibration.maps import Calibration, normalise
+from dexsim.calibration.maps import Calibration
 from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
 
@@ -46,8 +46,9 @@ def plot_calibration(
                 text = f"{motion}: {gain:.3g} F {offset:+.2g}, R² {side.r_squared[way, joint]:.3f}"
                 axis.plot(force[direction == sign], value[direction == sign], ".", ms=2, alpha=0.35, color=f"C{way}")
                 axis.plot(ends, lines[-1], color=f"C{way}", lw=1.4, label=text)
-            row[2].plot(*normalise(side, joint, force, value), ".", ms=2, alpha=0.3, color=colour)
-            row[2].plot(*normalise(side, joint, ends, np.mean(lines, 0)), color=colour, lw=1.4, label=label)
+            most = side.force_max[joint], side.value_max[joint] * np.sign(side.gain[0, joint])
+            row[2].plot(force / most[0], value / most[1], ".", ms=2, alpha=0.3, color=colour)
+            row[2].plot(ends / most[0], np.mean(lines, 0) / most[1], color=colour, lw=1.4, label=label)
         row[2].set(title="both, normalised", xlabel="force / its maximum", xlim=(-0.05, 1.05), ylim=(-0.15, 1.15))
         for axis in row:
             axis.legend(fontsize=6)

@@ -1,20 +1,29 @@
 """System identification: actuator parameters from commanded and measured joint positions.
 
 Output error: the joint is simulated from the commands alone (`dexsim.identification.joint`), and the parameters are
-moved until its readings are the log's (`dexsim.identification.search`).
+moved until its readings are the log's.
+
+Inner loop of this search: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops
+without gradient: scans over latency (a whole number) and dead-band (a threshold), and a cross-entropy search, as a
+dead-band makes the cost rugged.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.special import stdtrit
 
-from dexsim.calibration.line import LEAST_PRESSES, jackknife
+from dexsim.calibration.line import LEAST_PRESSES
 from dexsim.calibration.signals import check_signals
 from dexsim.core.errors import CalibrationError
+from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
-from dexsim.identification.search import CHI2, Search
 
 MIN_SAMPLES = 200
 MIN_MOTION = 0.02
@@ -26,6 +35,14 @@ _NULL = 1e-4  # singular values below this share of the largest are none: the Ja
 _CORRELATED, _VAGUE = 0.97, 0.5
 _NORMAL = 1.96  # 97.5 % quantile
 _GROUP = "the data do not separate or do not show {}: docs/calibration.md says what to record"
+
+_BLUR = 2e-3  # rad, width of the dead-band's edges in the gradient
+_CHI2 = 3.84  # 95 %, one parameter
+_THRESHOLD = 7.35  # 95 % for a threshold (Hansen 2000): the likelihood has a kink there
+_NOISE = (0.002, 0.02)  # rad, Nm: weights of angle and torque to begin with
+
+# In the order of the arrays below: whatever is fitted, the compiled programs are the same.
+_NAMES = tuple(PARAMETERS)
 
 FIT = ("stiffness", "damping", "coulomb_friction", "viscous_friction", "stall_torque")
 """What is fitted by default, apart from latency, dead-band and the angles where it rests."""
@@ -113,15 +130,11 @@ def identify(
     first = {name: float(value) for name, value in search.fixed.items()}
     values = first | dict(zip(search.names, search.theta.tolist(), strict=True)) | {"start": float(search.starts[0])}
     size = np.maximum(np.abs(theta), search.typical[:count])  # what counts as a relative change of 1
-    jacobian = search.jacobian(search.theta, search.starts)
-    columns = np.r_[np.arange(count), np.arange(len(search.theta), jacobian.shape[1])]
+    jacobian = search.jacobian(search.theta, search.starts, count)
     sizes = np.append(size, np.full(len(search.starts), 0.05))
-    half, correlation, null = uncertainty(jacobian[:, columns], residual, sizes, search.segment)
+    half, correlation, null = uncertainty(jacobian, residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
     least, largest = (part[:count] for part in search.plausible())
-    if dead_band is not None:
-        ends = search.dead_band_profile(dead_band)
-        least[-1], largest[-1] = min(ends[0], least[-1]), max(ends[1], largest[-1])
     # What was seen to fit as well farther off widens what the curvature says.
     least, largest = np.minimum(theta - half, least).clip(low), np.maximum(theta + half, largest).clip(None, high)
     vague = np.maximum(half, (largest - least) / 2) > _NORMAL * _VAGUE * size
@@ -132,7 +145,7 @@ def identify(
     cost = {}
     for search.latency in sorted(latencies):
         cost[search.latency] = search.solve(search.theta, 10)[0]
-    limit = min(cost.values()) * (1 + CHI2 / max(residual.size - count, 1))
+    limit = min(cost.values()) * (1 + _CHI2 / max(residual.size - count, 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")
     if holdout is not None:
@@ -184,9 +197,9 @@ def uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Half-widths and correlations from a least-squares solution.
 
-    The widest of three intervals counts: that of independent residuals, and jackknives over the segments and over equal
-    stretches of time. What the model gets wrong differs from signal to signal, and residuals that follow each other go
-    together.
+    The widest of three intervals counts: that of independent residuals, and those of residuals that go together in the
+    segments, and in equal stretches of time. What the model gets wrong differs from signal to signal, and residuals
+    that follow each other go together.
 
     Args:
       jacobian: [N, P] of the weighted residuals [N], N a multiple of the instants T (channels).
@@ -197,24 +210,36 @@ def uncertainty(
       Half of the 95 % intervals [P] (infinite for members of null directions), correlation [P, P], and the null
       directions [P] as boolean masks of their members.
     """
-    relative = jacobian * size
-    _, singular, right = np.linalg.svd(relative, full_matrices=False)
+    left, singular, right = np.linalg.svd(jacobian * size, full_matrices=False)
     determined = singular > _NULL * singular[0]
     null = [np.abs(v) > 0.15 * np.max(np.abs(v)) for v in right[~determined]]
-    inverse = (right[determined].T / singular[determined] ** 2) @ right[determined]
-    covariance = inverse * np.sum(residual**2) / max(len(residual) - len(size), 1)
+    basis, solution = left[:, determined], right[determined].T / singular[determined]  # [N, D], [P, D]
+    covariance = solution @ solution.T * np.sum(residual**2) / max(len(residual) - len(size), 1)
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     half = _NORMAL * spread
     for group in (segment, np.arange(len(segment)) * _PARTS // len(segment)):
-        if len(np.unique(group)) >= LEAST_PRESSES:
-            own = np.tile(group, len(residual) // len(group))
-            half = np.maximum(half, jackknife(relative, relative, residual, own))
+        own = np.tile(group, len(residual) // len(group)) == np.unique(group)[:, None]
+        if len(own) >= LEAST_PRESSES:
+            moved = np.array([_influence(basis[rows], residual[rows]) for rows in own]) @ solution.T
+            half = np.maximum(half, stdtrit(len(own) - 1, 0.975) * np.linalg.norm(moved, axis=0))
     half = half * size
     correlation = covariance / np.outer(spread, spread)
     for members in null:
         half[members] = np.inf
         correlation[members], correlation[:, members] = np.nan, np.nan
     return half, correlation, null
+
+
+def _influence(basis: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """How a group of residuals [n] moves a fit [D], by its rows [n, D] of the orthonormal basis of all residuals.
+
+    A fit follows the group that shows a parameter best, which makes that group's residuals too small. The root of the
+    share that other groups have in each direction corrects this (CR2 of Bell and McCaffrey 2002). A jackknife divides
+    by the share itself, and explodes where one group has nearly all of it: the place of a dead-band's edge, say.
+    """
+    share, axes = np.linalg.eigh(basis.T @ basis)
+    weight = np.where(share < 1 - 1e-6, 1 / np.sqrt(np.maximum(1 - share, 1e-6)), 0.0)  # 1: a start of its own
+    return axes @ (weight * (axes.T @ (basis.T @ residual)))
 
 
 def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> float:
@@ -248,3 +273,289 @@ def check_log(log: JointLog) -> None:
             f"{log.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of "
             "motion is needed, target and position in the same unit"
         )
+
+
+# --- the search -----------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class _Data:
+    """A log on the device; C channels: the angle, and the torque if it was recorded."""
+
+    target: jax.Array  # [T] rad
+    measured: jax.Array  # [C, T] rad, Nm
+    segment: jax.Array  # [T]
+    timestep: jax.Array  # s
+    substeps: int = static()
+
+
+@functools.partial(jax.jit, static_argnames="blur")
+def _readings(data: _Data, values: jax.Array, starts: jax.Array, latency: jax.Array, blur: float = 0.0) -> jax.Array:
+    """[C, T] angle and torque, from all parameters and each sample's segment's start [T]."""
+    named = dict(zip(_NAMES, values, strict=True)) | {"start": starts}
+    out = simulate(named, data.target, latency, data.timestep, data.substeps, data.segment, blur)
+    return jnp.stack(out[: len(data.measured)])
+
+
+@jax.jit
+def _slopes(data: _Data, values: jax.Array, starts: jax.Array, latency: jax.Array) -> jax.Array:
+    """[C, T, P + 1] derivatives of `_readings` by all parameters and by the segment's start.
+
+    The dead-band's edges are blurred: the exact gradient does not see that a parameter moves the
+    instant at which the torque switches.
+    """
+
+    def blurred(values: jax.Array, shift: jax.Array) -> jax.Array:
+        return _readings(data, values, starts + shift, latency, blur=_BLUR)
+
+    by_value, by_start = jax.jacfwd(blurred, (0, 1))(values, jnp.zeros(()))
+    return jnp.concatenate([by_value, by_start[..., None]], -1)
+
+
+@jax.jit
+def _crowd_costs(data: _Data, crowd: jax.Array, starts: jax.Array, latency: jax.Array, weight: jax.Array) -> jax.Array:
+    """Weighted sums of squares [N] for parameters [N, P]."""
+
+    def cost(values: jax.Array) -> jax.Array:
+        error = _readings(data, values, starts, latency) - data.measured
+        return jnp.sum((error * weight[:, None]) ** 2)
+
+    return jax.vmap(cost)(crowd)
+
+
+class Search:
+    """One log's least squares: theta [P] (what is fitted, the dead-band last), the starts [S], and the latency.
+
+    The arguments are those of `identify`, the log is checked.
+
+    Raises:
+      CalibrationError: a name that cannot be fitted, or a first guess out of its bounds.
+    """
+
+    def __init__(
+        self,
+        log: JointLog,
+        start: Mapping[str, float],
+        fit: tuple[str, ...],
+        substeps: int,
+        dead_band: tuple[float, float] | None,
+    ):
+        names = [name for name in PARAMETERS if name != "dead_band"]
+        for name in fit:
+            if name not in names:
+                raise CalibrationError(f"cannot fit {name!r}: choose from {', '.join(names)}")
+        self.dead_band = dead_band
+        self.fixed = with_defaults(dict(start), log)
+        self.segment, angle = segments(log)
+        self.names = (*dict.fromkeys(fit), "dead_band")
+        self.count = len(self.names) - (dead_band is None)
+        """Parameters that are fitted in the end."""
+        parameters = [PARAMETERS[name] for name in self.names]
+        self.low, self.high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
+        self.low[-1], self.high[-1] = dead_band or (self.low[-1], self.high[-1])
+        self.typical = np.array([p.typical for p in parameters])
+        begin = np.array([float(self.fixed[name]) for name in self.names])
+        for name, value, low, high in zip(self.names, begin, self.low, self.high, strict=True):
+            if not low <= value <= high:
+                raise CalibrationError(
+                    f"{log.name}: {name} starts at {value:g}, outside its bounds {low:g} to {high:g}"
+                )
+        self._index = np.array([_NAMES.index(name) for name in self.names])
+        self._values = np.array([float(self.fixed[name]) for name in _NAMES])
+        self.scale = np.maximum(np.abs(begin), self.typical)
+        # From a bound, where a friction's gradient may vanish, the search would not set off.
+        inside = 0.05 * np.minimum(self.scale, self.high - self.low)
+        self.theta = np.clip(begin, self.low + inside, self.high - inside)
+        self.theta[-1] = begin[-1]
+        self.starts = self._rests = angle - float(self.fixed["encoder_bias"])
+        self.measured = np.stack([log.position] if log.torque is None else [log.position, log.torque])
+        self.noise = np.array(_NOISE)[: len(self.measured)]
+        self.timestep, self.latency, self.best = log.period / substeps, 0, np.inf
+        self._seen: list[tuple[np.ndarray, np.ndarray]] = []  # candidates and their costs
+        self._data = _Data(
+            jnp.asarray(log.target, jnp.float32),
+            jnp.asarray(self.measured, jnp.float32),
+            jnp.asarray(self.segment),
+            jnp.float32(self.timestep),
+            substeps,
+        )
+
+    def run(self, latencies: tuple[int, ...]) -> None:
+        """Fit once with the given weights, and once with those found."""
+        self._scan_latencies(latencies)
+        for fine in (False, True):
+            if self.dead_band is not None:
+                self._search_dead_band(self.dead_band, fine)
+            self._scan_latencies(tuple(lag for lag in latencies if abs(lag - self.latency) <= 1))
+            self._settle(last=fine)
+
+    # --- the inner loop ---------------------------------------------------------------------------
+
+    def residual(self, theta: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Weighted residuals [C * T]."""
+        error = self._call(_readings, theta, starts) - self.measured
+        return (error / self.noise[:, None]).ravel()
+
+    def jacobian(self, theta: np.ndarray, starts: np.ndarray, count: int) -> np.ndarray:
+        """Of `residual`, [C * T, count + S], by the first parameters, in their own units, and the starts."""
+        slope = self._call(_slopes, theta, starts) / self.noise[:, None, None]
+        own = slope[..., -1:] * (self.segment[:, None] == np.arange(len(starts)))
+        slope = np.concatenate([slope[..., self._index[:count]], own], -1)
+        return slope.reshape(-1, slope.shape[-1])
+
+    def solve(
+        self, theta: np.ndarray, evaluations: int, with_band: bool = False
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Sum of squares, theta and starts of the fit by gradient; the dead-band stays unless asked."""
+        count, parts = len(theta) - (not with_band), len(self.starts)
+        scale = np.concatenate([self.scale[:count], np.full(parts, 0.01)])
+        reach = 0.05  # rad that a start may be off the angle that was read
+        low = np.concatenate([self.low[:count], self.starts - reach]) / scale
+        high = np.concatenate([self.high[:count], self.starts + reach]) / scale
+
+        def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return np.concatenate([x[:count] * scale[:count], theta[count:]]), x[count:] * 0.01
+
+        result = least_squares(
+            lambda x: self.residual(*split(x)),
+            np.concatenate([theta[:count], self.starts]) / scale,
+            jac=lambda x: self.jacobian(*split(x), count) * scale,
+            bounds=(low, high),
+            method="trf",
+            xtol=1e-6,
+            ftol=1e-7,
+            gtol=1e-10,
+            max_nfev=evaluations,
+        )
+        return 2.0 * float(result.cost), *split(result.x)
+
+    def _attempt(self, theta: np.ndarray, evaluations: int, with_band: bool = False) -> float:
+        """Sum of squares that is reached from here; keeps the solution if it is the best."""
+        cost, theta, starts = self.solve(theta, evaluations, with_band)
+        if cost < self.best:
+            self.best, self.theta, self.starts = cost, theta, starts
+        return cost
+
+    def _call(
+        self, function: Callable[..., jax.Array], theta: np.ndarray, starts: np.ndarray, *more: Any, far: float = 1e3
+    ) -> np.ndarray:
+        """`function` of the log, of all parameters [..., len(_NAMES)] from the fitted ones [..., P], and the starts."""
+        values = np.broadcast_to(self._values, (*theta.shape[:-1], len(_NAMES))).copy()
+        values[..., self._index] = theta
+        by_sample = jnp.asarray(starts[self.segment], jnp.float32)
+        out = function(self._data, jnp.asarray(values, jnp.float32), by_sample, jnp.int32(self.latency), *more)
+        return np.nan_to_num(np.asarray(out, float), nan=far, posinf=far, neginf=-far)
+
+    # --- the outer loops --------------------------------------------------------------------------
+
+    def _scan_latencies(self, candidates: tuple[int, ...]) -> None:
+        self.best, costs = np.inf, {}
+        for self.latency in candidates:
+            costs[self.latency] = self._attempt(self.theta, 6)
+        self.latency = min(costs, key=costs.__getitem__)
+
+    def _search_dead_band(self, span: tuple[float, float], fine: bool) -> None:
+        """Scan the range, or five values about the present one, then Brent's method."""
+        cell = (span[1] - span[0]) / 10
+        near = np.clip(self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
+        grid = near if fine else np.linspace(*span, 11)
+        self.best = np.inf
+
+        def cost(width: float) -> float:
+            return self._attempt(np.append(self.theta[:-1], width), 5)
+
+        at = int(np.argmin([cost(width) for width in grid]))
+        minimize_scalar(
+            cost,
+            method="bounded",
+            bounds=(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]),
+            options={"xatol": 2e-3 * (span[1] - span[0])},
+        )
+
+    def _settle(self, last: bool) -> None:
+        """Solve to the end, and take each channel's noise from what the fit leaves."""
+        self.best, with_band = np.inf, self.dead_band is not None
+        self._attempt(self.theta, 30)
+        if with_band:
+            self._attempt(self.theta, 30, with_band=True)
+        # Without a dead-band there is next to nothing to get lost in.
+        self._start_over(tries=(6 if last else 10) if with_band else 2)
+        if with_band and not last:
+            self._explore(rounds=6)
+        left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
+        self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
+        if last:
+            self.best = np.sum(self.residual(self.theta, self.starts) ** 2)
+            self._explore(rounds=14 if with_band else 3)
+
+    def _start_over(self, tries: int) -> None:
+        """Solve again from about the present parameters and from the angles as they were read: a valley to which both
+        have settled together has no other way out."""
+        rng, best, starts = np.random.default_rng(1), self.theta, self.starts
+        for index in range(tries):
+            width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
+            theta = best + width * self.scale * rng.standard_normal(len(best))
+            theta[self.count :] = best[self.count :]
+            self.starts = self._rests
+            result = self.solve(np.clip(theta, self.low, self.high), 12, self.dead_band is not None)
+            if result[0] < self.best:
+                self.best, best, starts = result
+        self.theta, self.starts = best, starts
+
+    def _explore(self, rounds: int, crowd: int = 256) -> None:
+        """Cross-entropy search about the present solution, which a gradient cannot leave: a
+        dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
+        count, scale = self.count, self.scale[: self.count]
+        slope = self.jacobian(self.theta, self.starts, count)[:, :count] * scale
+        middle = self.theta[:count] / scale
+        spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
+        rng, weight = np.random.default_rng(0), 1.0 / jnp.asarray(self.noise, jnp.float32)
+        self._seen = []
+        for _ in range(rounds):
+            tries = rng.multivariate_normal(middle, spread, crowd)
+            tries = np.clip(tries, self.low[:count] / scale, self.high[:count] / scale)
+            tries[: 2 * count + 1] = middle
+            for end, bound in enumerate((self.low, self.high)):  # Where a limit binds hardly ever, curvature misleads.
+                tries[1 + end * count :][range(count), range(count)] = bound[:count] / scale
+            thetas = np.tile(self.theta, (crowd, 1))
+            thetas[:, :count] = tries * scale
+            costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)
+            order = np.argsort(costs)
+            self._seen.append((thetas, costs))
+            elite = tries[order[: crowd // 8]]
+            middle, spread = elite[0], 2.0 * np.cov(elite.T) + 1e-12 * np.eye(count)
+            before = self.best
+            self._attempt(thetas[order[0]], 6, self.dead_band is not None)
+            if self.best < before:
+                middle = self.theta[:count] / scale
+
+    # --- what fits as well ------------------------------------------------------------------------
+
+    def plausible(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest of each parameter among all candidates that the data do not exclude."""
+        limit = self._limit(np.sum(self.residual(self.theta, self.starts) ** 2), self.dead_band is not None)
+        thetas, costs = (np.concatenate(parts) for parts in zip(*self._seen, strict=True))
+        within = np.concatenate([thetas[costs <= limit], self.theta[None]])
+        least, largest = within.min(0), within.max(0)
+        if self.dead_band is not None:
+            ends = self._profile_dead_band(self.dead_band)
+            least[-1], largest[-1] = min(ends[0], least[-1]), max(ends[1], largest[-1])
+        return least, largest
+
+    def _profile_dead_band(self, span: tuple[float, float]) -> list[float]:
+        """Where the sum of squares, fitted anew, rises by the critical value of a threshold."""
+        limit, ends = self._limit(self.solve(self.theta, 15)[0], True), list[float]()
+        for way, end in ((-1, span[0]), (1, span[1])):
+            step, last = 2e-3 * (span[1] - span[0]), self.theta[-1]
+            while way * (end - last) > 0:
+                tried = float(np.clip(last + way * step, *span))
+                if self.solve(np.append(self.theta[:-1], tried), 6)[0] > limit:
+                    break
+                last, step = tried, 1.6 * step
+            ends.append(float(np.clip(last + way * step, *span)))  # the first that is excluded
+        return ends
+
+    def _limit(self, least: float, threshold: bool) -> float:
+        """The largest sum of squares that the data do not exclude."""
+        freedom = max(self.measured.size - len(self.theta), 1)
+        return least * (1 + (_THRESHOLD if threshold else _CHI2) / freedom)

@@ -79,7 +79,6 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
 def table(calibration: Calibration, joints: Mapping[str, JointFit], hand: Hand) -> list[str]:
     """Lines of a table with one row per joint. A cell has loading / unloading, or the worse of the two."""
     real, (constants, errors) = calibration.real, torque_constants(calibration)
-    assert calibration.force_per_torque is not None, "`press_fit.fit` gives it"
     tip = dict(zip(hand.root_joint.tolist(), calibration.force_per_torque[0], strict=True))
     rows = [f"{'joint':15}{'pressed with':14}{'Nm / A':>15}{'95 %':>9}  R2     friction  max force  tip N / Nm"]
     for joint, name in enumerate(calibration.joint_names):

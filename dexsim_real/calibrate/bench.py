@@ -141,11 +141,13 @@ class Operator:
         """Print one line."""
         print(text, file=self.out, flush=True)
 
-    def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
-        """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.
+    def ask(self, text: str, meanwhile: Callable[[], object]) -> str | None:
+        """Ask a question; returns the stripped answer, None for an s. `meanwhile` is called until it arrives.
 
         Raises HandError: the input is closed.
         """
+        if self.assume_yes:
+            return ""
         if self._stream.isatty():
             termios.tcflush(self._stream, termios.TCIFLUSH)  # Discard keys pressed before the question.
         self.tell(text)
@@ -161,13 +163,13 @@ class Operator:
             meanwhile()
         if not lines[-1]:
             raise HandError("standard input is closed; run in a terminal, or give --yes")
-        return lines[-1].strip()
+        return None if (answer := lines[-1].strip()).lower() in ("s", "skip", "stop") else answer
 
     def ask_force(self, meanwhile: Callable[[], object]) -> float | None:
         """Ask for the reading of the gauge in N until it is one; None when the user skips it."""
         while True:
             text = self.ask("  reading of the gauge (newtons, or a number with g or kg; s skips):", meanwhile)
-            if text.lower() in ("s", "skip"):
+            if text is None:
                 return None
             try:
                 return parse_reading(text)
@@ -257,11 +259,10 @@ class Bench(ExchangeLoop):
         if error is None and self.log.losses:
             raise HandError(self.log.losses)
 
-    def step(self, target: np.ndarray | None = None, mark: dict[str, Any] | None = None) -> HandSample | None:
+    def step(self, target: np.ndarray | None = None) -> HandSample | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
 
-        `target` [J] rad are the requested joint targets, None keeps the last ones; `mark` is the annotation with which
-        a sample is logged.
+        `target` [J] rad are the requested joint targets, None keeps the last ones.
 
         Raises HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
         """
@@ -273,11 +274,7 @@ class Bench(ExchangeLoop):
         self._newest = {"sent": now, "command": self.command.tobytes(), "answer": answer}
         self._check(now, sample)
         self.pace.wait()
-        if sample is None or self.safety.problem:
-            return None
-        if mark:
-            self.annotate(mark)
-        return sample
+        return None if self.safety.problem else sample
 
     def annotate(self, mark: dict[str, Any]) -> None:
         """Log the newest exchange with an annotation."""
@@ -286,11 +283,13 @@ class Bench(ExchangeLoop):
     def collect(
         self, seconds: float, target: np.ndarray | None = None, mark: dict[str, Any] | None = None
     ) -> list[HandSample]:
-        """The samples of this duration in s; arguments and errors as for `step`, or there is none."""
+        """The samples of this duration in s, logged with this annotation; errors as for `step`, or there is none."""
         until, samples = self.clock() + seconds, list[HandSample]()
         while self.clock() < until:
-            if (sample := self.step(target, mark)) is not None:
+            if (sample := self.step(target)) is not None:
                 samples.append(sample)
+                if mark:
+                    self.annotate(mark)
         if not samples:
             raise HandError(f"no usable answer in {seconds:g} s; check the cable")
         return samples
@@ -361,20 +360,16 @@ def read_logs(paths: Iterable[Path], task: str) -> tuple[Source, list[list[Recor
     """
     sources, logs = list[Source](), []
     for path in paths:
-        records = []
         with reading(path):
-            for record in LogReader(path):
-                content = record.content
-                if record.kind == Kind.META and "task" in content:
-                    if content["task"] != task:
-                        raise LogError(f"{path}: this is a log of {content['task']!r}; give one of {task!r}")
-                    hardware = from_dict(HardwareConfig, content["hardware"])
-                    sources.append(Source(hardware, content["rate"], Identity(*content["identity"])))
-                elif record.kind in (Kind.META, Kind.TICK):
-                    records.append(record)
+            records = [record for record in LogReader(path) if record.kind in (Kind.META, Kind.TICK)]
+            if not records:
+                raise LogError(f"{path}: the log ends before the hand was ready; record again")
+            meta = records.pop(0).content
+            if meta["task"] != task:
+                raise LogError(f"{path}: this is a log of {meta['task']!r}; give one of {task!r}")
+            hardware = from_dict(HardwareConfig, meta["hardware"])
+            sources.append(Source(hardware, meta["rate"], Identity(*meta["identity"])))
         logs.append(records)
-        if len(sources) < len(logs):
-            raise LogError(f"{path}: the log ends before the hand was ready; record again")
         for what, own, first in zip(("--hardware options", "--rate", "hand"), sources[-1], sources[0], strict=True):
             if own != first:
                 raise LogError(f"{path}: has another {what} than the logs before: {own!r:.80}")

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim.calibration.maps import Calibration, joint_torque, load_calibration
+from dexsim.calibration.maps import Calibration, load_calibration
 from dexsim.core import cli
 from dexsim.core.errors import DexsimError
 from dexsim.hand.description import Hand
@@ -100,7 +100,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     with stopping(), Bench(arguments, hand, operator, TASK, **bench) as work:
         try:
             work.set_zero(work.collect(_TARE))  # Otherwise `Safety` would mistake the taxels' zero error for a touch.
-            if not operator.assume_yes and operator.ask("  Enter starts, s stops:", work.step).lower() in ("s", "stop"):
+            if operator.ask("  Enter starts, s stops:", work.step) is None:
                 raise HandError("stopped before anything moved")
             work.await_motors()
             for name in signals["fit"]:
@@ -151,14 +151,11 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
     if not abs(step - period) <= _OFF * period or not missing <= _LOST * len(time) * period:
         found = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
         raise LogError(f"exchanges took {found}: set the adapter's latency timer to 1 ms, or lower --rate")
+    sensing, rows = HandSensing(hand, source.hardware, calibration), np.arange(len(marks))
+    commands = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
+    answers = [sensing.measure(sensing.decode(mark["answer"])) for mark in marks if mark["measured"]]
+    position, share = np.array([(answer.joint_position[joint], answer.joint_torque[joint]) for answer in answers]).T
     # Few samples are missing: interpolate them.
-    rows = np.arange(len(marks))
-    sensing = HandSensing(hand, source.hardware)
-    state = np.array([sensing.decode(mark["answer"])["joint"] for mark in marks if mark["measured"]])
-    command = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
-    target, position = (sensing.angles(part.astype(float))[:, joint] for part in (command, state["position"]))
-    torque = None
-    if calibration is not None:
-        current = 1e-3 * state["current"].astype(float)  # A
-        torque = np.interp(rows, rows[given], np.array(joint_torque(calibration, current))[:, joint])
+    torque = None if calibration is None else np.interp(rows, rows[given], share * calibration.torque_scale[joint])
+    target = sensing.angles(commands.astype(float))[:, joint]
     return JointLog(period, target, np.interp(rows, rows[given], position), torque, name)

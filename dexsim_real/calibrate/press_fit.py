@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, correlate, median_filter
 
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
@@ -30,7 +29,10 @@ from dexsim_real.calibrate.bench import Source, read_logs
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING
 from dexsim_real.core.log import Kind, Record
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.taxels import taxel_names
+from dexsim_real.sensors.taxels import around, taxel_names
+
+Scale = tuple[float, float, float]
+"""Of a press's taxel counts: N per count, N without counts, and the share (95 %) by which the first may be wrong."""
 
 _BLOCK = 0.25  # s averaged into one block, since counts are coarse
 _LEVER = 0.002  # m, 95 %, between the contact and the centre of the taxels' forces
@@ -42,7 +44,6 @@ _SHEAR = 0.1  # share of the force above which shear is noted
 _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
 
 _ACTIVE = 2.0  # counts above which a taxel takes part
-_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)  # the neighbours of a taxel
 _READINGS = 8  # gauge readings that a fingertip needs
 # Shares of the scale, 95 %, that no reading shows:
 _GAUGE = 0.03  # of the gauge itself, and of how straight it stands under a fingertip that turns by up to 0.25 rad
@@ -85,9 +86,8 @@ def read_presses(paths: Iterable[Path], hand: Hand) -> tuple[Source, dict[str, R
     source, logs = read_logs(paths, "calibrate")
     recordings: dict[str, Recording] = {}
     for records in logs:
-        for press in _presses(source, records, hand):
-            if press.finished or press.name not in recordings:
-                recordings[press.name] = press
+        own = _presses(source, records, hand)
+        recordings |= {press.name: press for press in own if press.finished or press.name not in recordings}
     return source, recordings
 
 
@@ -118,14 +118,8 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recordin
     recordings = []
     for name, (placement, gauge, samples) in presses.items():
         if samples:
-            recording = Recording(
-                name,
-                placement["finger"],
-                tuple(placement["joints"]),
-                source.rate,
-                gauge,
-                *(np.array(column) for column in zip(*samples, strict=True)),
-            )
+            columns = map(np.array, zip(*samples, strict=True))
+            recording = Recording(name, placement["finger"], tuple(placement["joints"]), source.rate, gauge, *columns)
             recording.shear -= zero[recording.finger]
             recordings.append(recording)
     return recordings
@@ -137,21 +131,14 @@ def _presses(source: Source, records: list[Record], hand: Hand) -> list[Recordin
 class Blocks(NamedTuple):
     """A press averaged over B blocks of a quarter of a second."""
 
-    counts: np.ndarray  # [B, N] of the taxels that take part, 0 of the others
+    counts: np.ndarray  # [B, N], as `repaired`
+    dead: np.ndarray  # [N] bool, taxels
     shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
     current: np.ndarray  # [B, J] A
     position: np.ndarray  # [B, J] rad
     speed: np.ndarray  # [B, J] rad/s
     run: np.ndarray  # [B] number of the loading or unloading phase
     press: np.ndarray  # [B] number of the press, up and down
-
-
-class Scale(NamedTuple):
-    """Newtons of a press's taxel counts: gain * counts + offset."""
-
-    gain: float
-    offset: float
-    error: float  # share of the gain, 95 %
 
 
 class JointFit(NamedTuple):
@@ -168,49 +155,33 @@ def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tupl
 
     Raises CalibrationError: recordings are missing or unusable.
     """
-    blocks, notes = {}, list[str]()
-    for name, recording in recordings.items():
-        if not recording.at(LOADING, UNLOADING).any():
-            continue
-        part = make_blocks(recording, hand)
-        if part.counts.sum() > 0:
-            blocks[name] = part
-        else:  # Without force no lever arm.
-            notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
+    loaded = {name: recording for name, recording in recordings.items() if recording.at(LOADING, UNLOADING).any()}
+    blocks, notes = {name: make_blocks(recording, hand) for name, recording in loaded.items()}, list[str]()
+    for name in [name for name, part in blocks.items() if not part.counts.any()]:  # Without force no lever arm.
+        notes.append(f"{name}: left out: no taxel read 2 counts or more; press on the taxels, or with more current")
+        del blocks[name]
     if not blocks:
         raise CalibrationError("; ".join(["no press was recorded; record again", *notes]))
-    per_count, scales, scale_notes = force_scale(source, hand, [recordings[name] for name in blocks])
+    per_count, scales = force_scale(source, hand, [loaded[name] for name in blocks], notes)
     joints = dict[str, JointFit]()
     for name, part in blocks.items():
-        for label, found in _press(hand, recordings[name], part, scales[name], notes).items():
+        for label, found in _press(hand, loaded[name], part, scales[name], notes).items():
             if label not in joints or found.lever > joints[label].lever:
                 joints[label] = found
+    real, sim = ({label: getattr(found, side) for label, found in joints.items()} for side in ("real", "sim"))
     try:
-        calibration = calibrate(
-            hand,
-            {label: found.real for label, found in joints.items()},
-            {label: found.sim for label, found in joints.items()},
-            force_per_count=per_count,
-            serial=source.identity.serial_number,
-            handedness=source.identity.handedness,
-        )
+        calibration = calibrate(hand, real, sim, per_count, *source.identity)
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from None
-    calibration = dataclasses.replace(
-        calibration,
-        force_per_torque=_force_per_torque(hand, calibration, joints),
-        notes=(*calibration.notes, *scale_notes, *notes),
-    )
-    return calibration, joints
+    ratio, notes = _force_per_torque(hand, calibration, joints), [*calibration.notes, *notes]
+    return dataclasses.replace(calibration, force_per_torque=ratio, notes=tuple(notes)), joints
 
 
 def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: list[str]) -> dict[str, JointFit]:
     """What one press says of each of its joints; of what it does not, it adds notes."""
-    name, finger = recording.name, recording.finger
-    dead = dead_taxels(hand, part.counts)
-    counts = fill_dead(hand, part.counts, dead)
+    name, finger, counts, (per_count, offset, error) = recording.name, recording.finger, part.counts, scale
     sums = counts.sum(-1)
-    force = sums * scale.gain + scale.offset
+    force = sums * per_count + offset
     # All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
     # fingertip is the sum over its taxels, as in simulation.
     shares = counts / np.maximum(sums, 1e-9)[:, None]
@@ -236,11 +207,11 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
             notes.append(f"{label}: hardly moved while the {name} was pressed; press on something softer, more often")
             continue
         # A force read too large makes the gain of the current too small, and leaves the lever arm.
-        known, placed = float(np.hypot(scale.error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
+        known, placed = float(np.hypot(error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
         real = JointPress(force, part.current[:, joint], way, part.press, known)
         fits[label] = JointFit(name, arm, real, JointPress(force, force * arms[:, joint], way, part.press, placed))
-    if dead.any():
-        which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, dead)}"
+    if part.dead.any():
+        which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, part.dead)}"
         notes.append(f"{which} read nothing while their neighbours were pressed; the fit uses the neighbours' mean")
     if shear > _SHEAR:
         notes.append(f"{name}: shear of {100 * shear:.0f} % of the force, ignored by the fit; press on what rolls")
@@ -257,23 +228,22 @@ def make_blocks(recording: Recording, hand: Hand) -> Blocks:
     Raises CalibrationError: no phase is long enough.
     """
     size, phase = max(round(_BLOCK * recording.rate), 1), recording.phase
-    runs, presses, before = list[np.ndarray](), list[int](), UNLOADING  # rows [blocks, size] of each, and its press
-    for rows in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
-        blocks = len(rows) // size
-        if phase[rows[0]] in (LOADING, UNLOADING) and blocks > 1:  # A single block has no speed.
-            begins = before == UNLOADING and phase[rows[0]] == LOADING
-            presses.append((presses[-1] if presses else 0) + begins)
-            runs.append(rows[: blocks * size].reshape(blocks, size))
-            before = phase[rows[0]]
+    runs = [
+        rows[: len(rows) // size * size].reshape(-1, size)
+        for rows in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1)
+        if phase[rows[0]] in (LOADING, UNLOADING) and len(rows) >= 2 * size  # A single block has no speed.
+    ]
     if not runs:
         raise CalibrationError(f"{recording.name}: no press lasted {2 * _BLOCK:g} s; raise --press.seconds")
     time, angle = recording.time, recording.position
     # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
+    rows, loading = np.concatenate(runs), phase == LOADING
     parts = (recording.counts, recording.shear, recording.current, angle)
-    counts, shear, current, position = (part[np.concatenate(runs)].mean(1) for part in parts)
-    run, press = (np.repeat(number, [len(run) for run in runs]) for number in (range(len(runs)), presses))
-    return Blocks(counts * active_taxels(hand, counts), shear, current, position, speed, run, press)
+    counts, shear, current, position = (part[rows].mean(1) for part in parts)
+    run = np.repeat(range(len(runs)), [len(run) for run in runs])
+    press = np.cumsum(np.diff(loading, prepend=False) & loading)[rows[:, 0]]
+    return Blocks(*repaired(hand, counts), shear, current, position, speed, run, press)
 
 
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
@@ -322,16 +292,14 @@ def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str,
 
 
 def force_scale(
-    source: Source, hand: Hand, pressed: Iterable[Recording]
-) -> tuple[np.ndarray, dict[str, Scale], list[str]]:
-    """Compare the taxels with the gauge. A press without readings uses those of the finger's other press.
+    source: Source, hand: Hand, pressed: Iterable[Recording], notes: list[str]
+) -> tuple[np.ndarray, dict[str, Scale]]:
+    """Newtons of a count [F] for a run, and the scale of each press, by the gauge; adds notes.
 
-    Returns:
-      Newtons of a count [F] for a run, the scale of each press, and notes.
-
-    Raises CalibrationError: the readings do not rise with the force.
+    A press without readings uses those of the finger's other press. Raises CalibrationError: the readings do not rise
+    with the force.
     """
-    own, scales, notes = dict[int, float](), dict[str, Scale](), list[str]()  # `own` by finger: N per count
+    own, scales = dict[int, float](), dict[str, Scale]()  # `own` by finger: N per count
     pressed = sorted(pressed, key=lambda press: not press.name.endswith("pad"))
     for press in pressed:
         levels = {level: press.at(level) for level in press.gauge if press.at(level).any()}
@@ -339,10 +307,7 @@ def force_scale(
             if levels:
                 notes.append(f"{press.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        counts = np.array([press.counts[rows].mean(0) for rows in levels.values()])
-        counts = counts * active_taxels(hand, counts)
-        # The fit applies this gain to sums with the dead taxels filled in.
-        counts = fill_dead(hand, counts, dead_taxels(hand, counts))
+        counts, _ = repaired(hand, np.array([press.counts[rows].mean(0) for rows in levels.values()]))
         gauge = np.array([press.gauge[level] for level in levels])
         if np.ptp(gauge) <= 0:
             raise CalibrationError(f"{press.name}, gauge: all readings are {gauge[0]:g} N")
@@ -350,7 +315,7 @@ def force_scale(
         if line.gain <= line.gain_error:
             raise CalibrationError(f"{press.name}, gauge: counts do not follow its readings ({line.gain:.3g} per N)")
         error = float(np.hypot(line.gain_error / line.gain, _GAUGE))
-        scales[press.name] = Scale(1.0 / line.gain, -line.offset / line.gain, error)
+        scales[press.name] = 1.0 / line.gain, -line.offset / line.gain, error
         found = f"{line.gain:.3g} +- {line.gain * np.hypot(error, _PLACE):.2g} counts per newton by the gauge"
         notes.append(f"{press.name}: {found} ({len(gauge)} readings), {line.offset:.1f} counts at zero force")
         own.setdefault(press.finger, 1.0 / line.gain)
@@ -363,26 +328,17 @@ def force_scale(
             notes.append(f"{name}: not compared with the gauge; has the others' mean (up to {100 * _OTHERS:.0f} % off)")
     for press in pressed:
         error = _PLACE if press.finger in own else _OTHERS if own else _NOMINAL
-        scales.setdefault(press.name, Scale(float(per_count[press.finger]), 0.0, error))
-    return per_count, scales, notes
+        scales.setdefault(press.name, (float(per_count[press.finger]), 0.0, error))
+    return per_count, scales
 
 
-def active_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [N] of the taxels that take part in counts [T, N] of a press, and of those beside them."""
-    active = (counts.max(0) >= _ACTIVE).reshape(hand.taxel_grid)
-    return binary_dilation(active, np.ones((3, 3))).ravel()
-
-
-def dead_taxels(hand: Hand, counts: np.ndarray) -> np.ndarray:
-    """Mask [N] of taxels that read nothing in counts [T, N] of a press, although half of their neighbours did."""
-    largest = counts.max(0).reshape(hand.taxel_grid)
-    return ((largest <= 0) & (median_filter(largest, footprint=_RING) >= _ACTIVE)).ravel()
-
-
-def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
-    """Counts [T, N] in which a dead taxel has the mean of its working neighbours."""
-    grid = (-1, *hand.taxel_grid)
-    ring, working = _RING[None].astype(float), np.where(dead, 0.0, 1.0)
-    total = correlate((counts * working).reshape(grid), ring, mode="constant")
-    near = correlate(working.reshape(grid), ring, mode="constant")
-    return np.where(dead, (total / np.maximum(near, 1)).reshape(counts.shape), counts)
+def repaired(hand: Hand, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Counts [T, N] of a press, and the mask [N] of dead taxels, which read nothing although half of their neighbours
+    did: they get the mean of their working neighbours. What reads next to nothing far from the press becomes 0."""
+    largest = counts.max(0, keepdims=True)
+    pressed, beside = largest >= _ACTIVE, around(hand, largest >= _ACTIVE)
+    dead = (largest <= 0) & (beside.sum(0) >= around(hand, np.ones(largest.shape)).sum(0) / 2)
+    working = np.where(dead, 0.0, 1.0)
+    total, near = around(hand, counts * working).sum(0), around(hand, working).sum(0)
+    filled = np.where(dead, total / np.maximum(near, 1), counts)
+    return np.where(pressed | beside.any(0), filled, 0.0), dead[0]

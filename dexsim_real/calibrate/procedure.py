@@ -32,7 +32,11 @@ TOUCHED = 20.0
 _OPEN = 0.1  # rad, of the joints that do not press
 _SHARE = 0.3  # of the longest lever arm, above which a joint takes part
 _SPREADS = "index_bend"  # joint of the XHand: other hands are pressed on their pads alone
-_SIDES = {0: "palm's normal", 1: "thumb"}  # its fingers with a joint that spreads them, and where that side faces
+# Its fingers with a joint that spreads them: angles rad of the joints that are not open, and what the user holds.
+_SIDES: dict[int, tuple[dict[int, float], str]] = {
+    0: ({0: 0.4}, "the pen, 3 mm in front of the side that faces the palm's normal"),
+    1: ({3: -0.1, 4: 0.35, 5: 0.1}, "the pen, 3 mm in front of the side that faces the thumb"),
+}
 _BENT = (0.3, 0.3, 0.2), (0.35, 0.2)  # rad, joints of the pressing thumb, and of another finger, from the root on
 
 _REST = 2.0  # s, recording with the motors off
@@ -58,7 +62,7 @@ class Placement:
     joints: tuple[int, ...]  # joints that press
     posture: np.ndarray  # [J] rad, at the expected contact
     direction: np.ndarray  # [J] rad of targets for each rad of advance; the largest is 1
-    task: str  # instruction for the user
+    task: str  # what the user holds, and where
 
 
 def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
@@ -67,29 +71,26 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     if unknown := sorted(set(fingers) - set(hand.finger_names)):
         raise HandError(f"no finger {unknown[0]!r}; choose from {', '.join(hand.finger_names)}")
     selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
-    columns, rows = hand.taxel_grid
-    middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
-    plan = []
+    columns, plan = hand.taxel_grid[0], list[Placement]()
     for finger in sorted(selected, key=lambda i: i == 0):
         # Bent a little more than the others.
-        name = hand.finger_names[finger]
         joints = finger_joints(hand, 0) if finger == 0 else flexion_joints(hand, range(finger, finger + 1)).tolist()
-        bent = dict(zip(joints, _BENT[finger > 0], strict=False))
-        task = f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it"
-        plan.append(_placement(hand, f"{name} pad", finger, middle, bent, task))
+        bent, task = dict(zip(joints, _BENT[finger > 0], strict=False)), "a round pen, backed by foam, 1 cm in front"
+        plan.append(_placement(hand, finger, "pad", (columns // 2 - 1, columns // 2), bent, task))
     for finger in [i for i in selected if sides and i in _SIDES and _SPREADS in hand.joint_names]:
-        name = hand.finger_names[finger]
         # The index finger of a left hand has the sensor of a right one: its first columns face the thumb.
         column = 1 if finger == 1 and hand.side == "left" else columns - 2
-        side = [column * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
-        bent = {0: 0.4} if finger == 0 else {3: -0.1, 4: 0.35, 5: 0.1}
-        task = f"hold the pen across the side of the {name} that faces the {_SIDES[finger]}, 3 mm in front of it"
-        plan.append(_placement(hand, f"{name} side", finger, side, bent, task))
+        bent, task = _SIDES[finger]
+        plan.append(_placement(hand, finger, "side", (column,), bent, task))
     return plan
 
 
-def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict[int, float], task: str) -> Placement:
-    """A press at the mean of these taxels; `bent` gives the angles rad of the joints that are not open."""
+def _placement(
+    hand: Hand, finger: int, part: str, columns: tuple[int, ...], bent: dict[int, float], task: str
+) -> Placement:
+    """A press in the middle of these columns of taxels; `bent` gives the angles rad of the joints that are not open."""
+    rows = hand.taxel_grid[1]
+    taxels = tuple(column * rows + row for column in columns for row in (rows // 2 - 2, rows // 2 - 1))
     posture = np.where(np.array(hand.joint_names) == _SPREADS, 0.0, _OPEN)
     posture = np.clip(posture, hand.joint_lower, hand.joint_upper)
     posture[list(bent)] = list(bent.values())
@@ -97,7 +98,7 @@ def _placement(hand: Hand, name: str, finger: int, taxels: list[int], bent: dict
     share = arms / np.max(np.abs(arms))
     direction = np.where(np.abs(share) > _SHARE, share, 0.0)
     joints = tuple(np.flatnonzero(direction).tolist())
-    return Placement(name, finger, tuple(taxels), joints, posture, direction, task)
+    return Placement(f"{hand.finger_names[finger]} {part}", finger, taxels, joints, posture, direction, task)
 
 
 class MissedPress(HandError):
@@ -150,11 +151,9 @@ class PressProcedure:
     def _press(self, placement: Placement) -> bool:
         self._placement = placement
         self._start()
-        self.operator.tell(f"{placement.name}: {placement.task}")
-        if not self.operator.assume_yes:
-            answer = self.operator.ask("  Enter presses, s skips:", lambda: self.bench.step(self._target()))
-            if answer.lower() in ("s", "skip"):
-                return False
+        self.operator.tell(f"{placement.name}: hold {placement.task}")
+        if self.operator.ask("  Enter presses, s skips:", lambda: self.bench.step(self._target())) is None:
+            return False
         self._tare_in_air()
         self._approach()
         speed = self.config.first_speed
@@ -190,8 +189,6 @@ class PressProcedure:
         """Advance until contact, where the advance is set to zero."""
         name = self._placement.name
         for sample in self._advancing(self.config.approach_speed):
-            if sample is None:
-                continue
             if self._force(sample) >= self._touch:
                 self._base, self._advance = self._target(), 0.0
                 return
@@ -203,18 +200,18 @@ class PressProcedure:
     def _load(self, speed: float) -> None:
         """Press until peak force, current or travel is reached, or the motors stall."""
         assert self.bench.safety.sample is not None, "the approach has read the pose"
-        begin, first = self.bench.safety.sample.measured.joint_position.astype(float), self._target()
-        second = round(self.bench.arguments.rate)
+        before, first = self.bench.safety.sample, self._target()
+        begin, second = before.measured.joint_position.astype(float), round(self.bench.arguments.rate)
         forces, positions = list[float](), list[np.ndarray]()
         for sample in self._advancing(speed, LOADING):
-            if sample is None:
+            if sample.sequence != before.sequence + 1:
                 forces.clear()  # After an interruption a constant force does not mean that the motors stall.
-                continue
+            before = sample
             forces.append(self._force(sample))
             positions.append(sample.measured.joint_position.astype(float))
-            before = np.mean(forces[-second - _LAST : -second]) if len(forces) > 2 * second else -np.inf
+            earlier = np.mean(forces[-second - _LAST : -second]) if len(forces) > 2 * second else -np.inf
             ended = forces[-1] >= self.config.peak or self._overloaded(sample)
-            if ended or np.mean(forces[-_LAST:]) - before < _STALL * self.config.peak:
+            if ended or np.mean(forces[-_LAST:]) - earlier < _STALL * self.config.peak:
                 break
         if not ended and forces[-1] < 4 * self._touch:
             why = f"the force stays at {forces[-1]:.1f} N; press on something firmer, or raise --hardware.torque-max"
@@ -250,17 +247,16 @@ class PressProcedure:
     def _seek(self, force: float, speed: float, phase: str = "") -> None:
         """Advance or retract until the force is passed, or a limit is reached."""
         for sample in self._advancing(speed, phase):
-            if sample is None:
-                continue
             over = (self._force(sample) - force) * math.copysign(1.0, speed)
             if over >= 0 or (speed > 0 and self._overloaded(sample)):
                 return
 
-    def _advancing(self, speed: float, phase: str = "") -> Iterator[HandSample | None]:
-        """Steps until the end of the travel."""
+    def _advancing(self, speed: float, phase: str = "") -> Iterator[HandSample]:
+        """Steps until the end of the travel; those without a sample, or held by `Safety`, are tried again."""
         end = _TRAVEL if speed > 0 else -_CLEARANCE
         while (end - self._advance) * speed > 0:
-            yield self._step(speed, phase)
+            if (sample := self._step(speed, phase)) is not None:
+                yield sample
 
     def _back_off(self) -> None:
         """Free the fingertip, and check that it does not read far below zero: it was touched when it was tared."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.calibration.maps import Calibration, Side
+from dexsim.calibration.maps import Calibration, Side, blank_calibration
 from dexsim.hand.description import Hand
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Controller, Tick
@@ -48,14 +48,12 @@ def ideal_calibration(hand: Hand) -> Calibration:
         zero = np.zeros_like(both)
         return Side(both, zero, zero, zero, zero + 1, 0 * one, one, one)
 
-    return Calibration(
+    return dataclasses.replace(
+        blank_calibration(hand),
         real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
         sim=side(np.full(hand.num_joints, _LEVER)),
-        torque_scale=hand.torque_limit,
         force_per_count=np.full(hand.num_fingers, FORCE_PER_COUNT),
-        hand=hand.name,
-        joint_names=hand.joint_names,
-        finger_names=hand.finger_names,
+        notes=(),
     )
 
 
