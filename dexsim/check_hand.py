@@ -127,7 +127,8 @@ def check_reach(hand: Hand) -> str:
     if not hand.grasp_posture or not hand.grasp_centre:
         return f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre"
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
-    away = 1e3 * np.linalg.norm(forward_kinematics(hand, posture).tip_position - centre, axis=-1).min()
+    tips = np.asarray(forward_kinematics(hand, posture).tip_position)
+    away = 1e3 * np.linalg.norm(tips - centre, axis=-1).min()
     if away > 1e3 * _REACH:
         return f"[grasp]: the fingertip nearest to centre is {away:.0f} mm away, expected {1e3 * _REACH:.0f} mm at most"
     centre[0] = palm_height(hand) + 0.005 + _BALL
