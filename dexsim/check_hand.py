@@ -72,7 +72,8 @@ def check_taxels(hand: Hand) -> str:
         if not parts:
             continue
         arrays = [np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")]
-        shape = sdf.Shape(tuple(part.kind for part in parts), *arrays, np.ones(len(parts), bool))
+        kinds, size, position, rotation = tuple(part.kind for part in parts), *arrays
+        shape = sdf.Shape(kinds, size, position, rotation, np.ones(len(parts), bool))
         position, normal = hand.taxel_position[finger], hand.taxel_normal[finger]
         distance, ahead = (np.asarray(sdf.signed_distance(position + s * normal, shape)) for s in (0.0, _STEP))
         depth, away = -1e3 * distance.min(), 1e3 * distance.max()

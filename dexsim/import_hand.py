@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
@@ -121,7 +121,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
         thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
         highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
         lowest = min(max(highest / 4, _CARRYING), highest)
-        grasp = {"posture": posture, "centre": centre, "finger_force": [lowest, highest]}
+        grasp: dict[str, Any] = {"posture": posture, "centre": centre, "finger_force": [lowest, highest]}
         path = write_hand(draft, name, remarks, folder, grasp)
         checks, passed = report(path)
         if not any("free of overlap" in line for line in checks):

@@ -183,7 +183,7 @@ def load_calibration(path: str | Path, hand: Hand) -> Calibration:
 
 def _calibration(table: dict[str, Any], hand: Hand) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
-    own = {"hand": hand.name, "joint_names": hand.joint_names, "finger_names": hand.finger_names}
+    own: dict[str, Any] = {"hand": hand.name, "joint_names": hand.joint_names, "finger_names": hand.finger_names}
     for name, expected in ({"format": FORMAT, "version": VERSION} | own).items():
         found = table.pop(name)
         if (tuple(found) if isinstance(found, list) else found) != expected:

@@ -70,7 +70,7 @@ def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
 
 def open_hand(hand: Hand) -> np.ndarray:
     """Joint angles [J] rad nearest to 0 that the ranges allow."""
-    return np.clip(np.float32(0.0), hand.joint_lower, hand.joint_upper)
+    return np.asarray(np.clip(np.float32(0.0), hand.joint_lower, hand.joint_upper))
 
 
 def finger_bodies(hand: Hand, finger: int) -> list[int]:

@@ -339,9 +339,8 @@ def _lay_taxels(table: HandFile, geoms: tuple[Geom, ...], tip_body: np.ndarray) 
                 raise ConfigError(f"facing = {finger.facing}: expected a direction across the pad {pad.name!r}")
             across /= np.linalg.norm(across)
             turn, (radius, half_length, _) = np.stack([across, np.cross(along, across), along], -1), pad.size.tolist()
-            pose = {"position": pad.position, "rotation": turn}
-            capsule = {"radius": radius, "half_length": half_length}
-            taxels.append(lay_taxels(table.taxel_grid, pitch=table.taxel_pitch or 0.0, **capsule, **pose))
+            capsule = {"radius": radius, "half_length": half_length, "pitch": table.taxel_pitch or 0.0}
+            taxels.append(lay_taxels(table.taxel_grid, position=pad.position, rotation=turn, **capsule))
     return _f32(taxels)
 
 

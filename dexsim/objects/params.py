@@ -72,12 +72,12 @@ def extent(object: ObjectParams, direction: jax.Array) -> jax.Array:
         if object.quat is not None:
             local = rotations.rotate_inverse(rotations.quat_to_matrix(object.quat[k]), direction)
         along, (a, b, c) = jnp.abs(local), object.size[k]
-        reach = {
+        reach_of = {
             "box": along[0] * a + along[1] * b + along[2] * c,
             "capsule": a + b * along[2],
             "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
         }
-        reaches.append(reach[kind])
+        reaches.append(reach_of[kind])
     reach = jnp.stack(reaches) + jnp.sum(object.position * direction[None], -1)
     return jnp.max(jnp.where(object.active, reach, -jnp.inf))
 
@@ -134,7 +134,8 @@ def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array,
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
-    fixed = {"com_offset": 0.0, "inertia_scale": 1.0, "restitution": damping_ratio(sum(config.restitution) / 2)}
+    restitution = damping_ratio(sum(config.restitution) / 2)
+    fixed: dict[str, Any] = {"com_offset": 0.0, "inertia_scale": 1.0, "restitution": restitution}
     near = {}
     for name, value in _properties_of(object, plain).items():
         middle = fixed[name] if name in fixed else sum(getattr(config, name)) / 2
@@ -206,7 +207,7 @@ _RATIOS = 3.0 * np.linspace(0.0, 1.0, 200) ** 2
 _RESTITUTIONS = restitution(_RATIOS)
 
 
-def damping_ratio(restitution: jax.Array) -> jax.Array:
+def damping_ratio(restitution: jax.Array | float) -> jax.Array:
     """Damping ratio [...], at most 3, of a contact that bounces with this restitution [...]; MuJoCo has no such
     parameter."""
     restitutions, ratios = (jnp.asarray(row[::-1], jnp.float32) for row in (_RESTITUTIONS, _RATIOS))
