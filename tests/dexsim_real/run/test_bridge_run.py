@@ -226,6 +226,15 @@ def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(hand, tmp_pat
         run.main(arguments(SimpleNamespace(port="sdk:my_sdk"), tmp_path))
 
 
+def test_a_run_ends_when_its_exchange_thread_has_failed():
+    def fail():
+        raise HandError("the exchange thread failed")
+
+    parts = SimpleNamespace(loop=SimpleNamespace(check=fail), safety=SimpleNamespace(latched=""))
+    with pytest.raises(HandError, match="the exchange thread failed"):
+        session.Session._check(parts)
+
+
 def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
     """A policy's file may be anybody's: of the files here it may name the TOML of a hand."""
     monkeypatch.setattr("dexsim.hand.source.load_hand", lambda *_: pytest.fail("it was opened"))

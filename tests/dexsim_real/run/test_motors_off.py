@@ -129,6 +129,8 @@ def test_the_guard_waits_for_a_cable():
         peer.close()
         guard = Guard(peer.port, QUICK, load_hand())
         guard.arm()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            guard._process.send_signal(number)  # It ignores them.
         guard.check()
         guard.dismiss(off=False)
         time.sleep(1.0)
