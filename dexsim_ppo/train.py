@@ -87,7 +87,7 @@ def train_policy(
       preset: sizes and durations, "auto", "cpu", "cpu-large" or "gpu".
       policy: a policy to fine-tune, a file or the name of a shipped one.
       resume: folder of a run, or one of its checkpoints, to resume.
-      options: other fields of `TrainArguments`, such as `minutes=5`, `seed=1`, `run_dir=Path("runs/mine")`.
+      options: other fields of `TrainArguments`, such as `minutes=5`, `seed=1`, `run_dir="runs/mine"`.
 
     Raises:
       ConfigError: an unknown task, or a value out of range.
@@ -101,6 +101,8 @@ def train_policy(
     if not (task or source):
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
     default = default_arguments(task, preset, source)
+    if options.get("run_dir"):
+        options["run_dir"] = Path(options["run_dir"])
     given = {"env": config, "ppo": ppo, "policy": str(policy) or None} | options
     default = _with_budget(default, {name for name, value in options.items() if value is not None})
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})

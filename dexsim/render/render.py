@@ -51,7 +51,7 @@ def render_frame(
     Raises:
       ValueError: a size without room for the scene.
     """
-    frame = snapshot.map(np.asarray)
+    frame = _finite(snapshot)
     finger_range = float(np.nanmax(np.append(frame.finger_force, frame.target_force)))
     draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
     return draw(frame, hand_poses(hand, frame.joint_position[None])[0])
@@ -76,7 +76,7 @@ def render_episode(
       ValueError: no snapshots, or see `render_frame`.
       OSError: the file cannot be written.
     """
-    snapshots = snapshots.map(np.asarray)
+    snapshots = _finite(snapshots)
     total = len(snapshots.joint_position)
     if total == 0:
         raise ValueError("render_episode: no snapshots to draw")
@@ -144,6 +144,13 @@ def camera_of(task: str, hand: Hand) -> Camera:
         return camera
     moved = np.asarray(camera.target) + np.asarray(hand.grasp_centre) - _GRASP_CENTRE
     return dataclasses.replace(camera, target=tuple(moved.tolist()))
+
+
+def _finite(snapshot: Snapshot) -> Snapshot:
+    """NumPy arrays with zeros for what is not finite (a broken simulation must still be shown), but for the target."""
+    arrays = snapshot.map(np.asarray)
+    clean = arrays.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x)
+    return dataclasses.replace(clean, target_force=arrays.target_force)
 
 
 def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float, size: tuple[int, int]) -> Path:
