@@ -100,6 +100,8 @@ class RunArguments(LoopOptions):
 
     def __post_init__(self):
         super().__post_init__()
+        if not any(self.imu_mount):
+            raise HandError("--imu-mount 0 0 0 0: is no orientation (w, x, y, z)")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")
 
