@@ -312,5 +312,7 @@ def test_the_page_shows_the_hand(page):
         return len(np.unique(picture.reshape(-1, 3), axis=0))
 
     assert wait_until(lambda: colors() > 200), "the canvas stays empty"
+    page.viewer.paused.value = True
+    time.sleep(0.5)
     page.get_by_role("button", name="reset").click()
-    assert wait_until(lambda: float(page.viewer.source._state.length) < 30)
+    assert wait_until(lambda: float(page.viewer.source._state.length) == 0)
