@@ -23,7 +23,7 @@ from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
 from dexsim.env.task import Task, check_task
 from dexsim.hand.description import Hand
-from dexsim.hand.load import DEFAULT, load_hand
+from dexsim.hand.load import DEFAULT, load_hand, shipped_hands
 from dexsim.tasks.grasp import config as grasp
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate import config as rotate
@@ -164,9 +164,8 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
 
 def catalog() -> dict[str, list[str]]:
     """Names of tasks, hands and shipped policies."""
-    hands = [path.stem for path in asset_path("hand").rglob("*.toml")]
     policies = [path.stem for path in asset_path("policies").glob("*.msgpack")]
-    return {"tasks": sorted(TASKS), "hands": sorted(hands), "policies": sorted(policies)}
+    return {"tasks": sorted(TASKS), "hands": sorted(shipped_hands()), "policies": sorted(policies)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
