@@ -76,7 +76,7 @@ class Evaluator:
 
         def step(carry, _):
             state, policy_carry = carry
-            policy_carry, action = act(params, policy_carry, state.obs["actor"])
+            policy_carry, action = act(params, policy_carry, self.seen(state.obs["actor"]))
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.protocol.snapshot)(state))
             measured = (dict(state.metrics), state.terminated), (frame, state.terminated[shown])
@@ -84,6 +84,10 @@ class Evaluator:
 
         first: Any = state, zero_carry(params.memory, (self.chunk,))
         return jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)[1]
+
+    def seen(self, observation: jax.Array) -> jax.Array:
+        """What the policy is given of the actor's observations [chunk, n]: all, unless an experiment changes it."""
+        return observation
 
     def _extremes(self, state: Any) -> jax.Array:
         """Two episodes [2] of a chunk: those of the lowest and the highest command, or the first and the last where

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import zero_shot
 
 import dexsim
@@ -24,6 +27,7 @@ from dexsim_real.twin.plant.parameters import skill_of
 from paper.data import BUDGETS, ROOT, Budget, Measure, Row
 from paper.held_out import NAMES, HeldOutGrasp
 
+TOUCH = ("contact_force", "contact_centre")
 HELD_OUT_POOL = 480
 FOREIGN = str(ROOT / "assets" / "plants" / "foreign_right.xml")
 NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
@@ -32,7 +36,8 @@ NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
 
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """Train a seed of a row, or finish its training; then measure the policy in both worlds, and of a row that says
-    what the emulated hand draws on a foreign plant as well.
+    what the emulated hand draws on a foreign plant as well, and in simulation without touch and with that of another
+    episode.
 
     A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
@@ -45,7 +50,17 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     }
     if row.plant:
         report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
+        report |= without_touch(load_policy(policy), budget)
     return report | {"training": training}
+
+
+def without_touch(policy: Policy, budget: Budget) -> dict[str, Any]:
+    """What a policy that observes touch does in simulation without it ("ablated") and with the touch of another episode
+    ("another"); nothing of one that does not."""
+    if not {entry.name for entry in policy.observation_layout}.issuperset(TOUCH):
+        return {}
+    ablated = simulate(policy.ablate(*TOUCH), (), budget)
+    return {"ablated": ablated, "another": simulate(policy, (), budget, AnotherTouch)}
 
 
 def measured(*worlds: str) -> Measure:
@@ -129,7 +144,19 @@ def sweep_settings(row: Row, point: float | None) -> list[str]:
     return [] if point is None else [setting.format(point, point) for setting in row.settings]
 
 
-def simulate(policy: Policy, settings: Sequence[str], budget: Budget) -> dict[str, Any]:
+class AnotherTouch(Evaluator):
+    """Episodes in which the policy feels what another episode's hand touches at the same time."""
+
+    def seen(self, observation: jax.Array) -> jax.Array:
+        """The observations [chunk, n] with touch from half a chunk further."""
+        layout = self.env.observation_layout["actor"]
+        touch = np.concatenate([np.full(entry.size, entry.name in TOUCH) for entry in layout])
+        return jnp.where(touch, jnp.roll(observation, self.chunk // 2, axis=0), observation)
+
+
+def simulate(
+    policy: Policy, settings: Sequence[str], budget: Budget, evaluator: type[Evaluator] = Evaluator
+) -> dict[str, Any]:
     """The report of a policy's evaluation in the environment that it was trained in, with changes to its configuration.
 
     Episodes are rounded up to whole batches of 64 (1,024 on a GPU).
@@ -139,7 +166,8 @@ def simulate(policy: Policy, settings: Sequence[str], budget: Budget) -> dict[st
         length = [f"evaluation_seconds={budget.seconds[skill]}"]
     config = json.dumps(override(policy.env_config, [*settings, *length]), sort_keys=True)
     episodes, batch = budget.episodes[skill], 1024 if budget.backend == "auto" else 64
-    return _report(_evaluator(policy.task, config, budget.backend, min(episodes, batch)), policy, episodes)
+    made = _evaluator(policy.task, config, budget.backend, min(episodes, batch), evaluator)
+    return _report(made, policy, episodes)
 
 
 def _report(evaluator: Evaluator, policy: Policy, episodes: int) -> dict[str, Any]:
@@ -149,10 +177,10 @@ def _report(evaluator: Evaluator, policy: Policy, episodes: int) -> dict[str, An
 
 
 @functools.lru_cache(maxsize=4)
-def _evaluator(task: str, config: str, backend: str, chunk: int) -> Evaluator:
+def _evaluator(task: str, config: str, backend: str, chunk: int, kind: type[Evaluator]) -> Evaluator:
     """Compiled evaluations; rows of one environment share them."""
     made = from_dict(find_task(task).config_class, json.loads(config))
-    return Evaluator(dexsim.make(task, made, backend=backend), chunk)
+    return kind(dexsim.make(task, made, backend=backend), chunk)
 
 
 @functools.lru_cache(maxsize=4)

@@ -89,17 +89,20 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
 def mean_turns(seed: dict[str, Any], world: str) -> dict[str, Any]:
     """Mean of the quarter turns in a trial, with its interval."""
     found = seed[world]["successes"]
-    return found["mean"] if world == "simulation" else found
+    return found if world in ("hand", "foreign") else found["mean"]
 
 
 def touch_map(experiment: Experiment, reports: Reports) -> list[list[str]]:
-    """Quarter turns of each world with touch and without it."""
+    """Quarter turns of each world with touch and without it, and in simulation where a policy trained with touch runs
+    without it or with that of another episode."""
     lines = [["orientation, object, pushes and friction"]]
     worlds = {"simulation": "simulation", "hand": "emulated hand", "foreign": "foreign plant"}
-    lines[0] += [f"{name}: {touch}" for name in worlds.values() for touch in ("touch", "none")] + ["measured"]
+    lines[0] += [f"{name}: {touch}" for name in worlds.values() for touch in ("touch", "none")]
+    lines[0] += ["simulation: touch ablated", "another's touch", "measured"]
     for row, without in zip(experiment.rows[::2], experiment.rows[1::2], strict=True):
         pair = [seeds(reports.get(each.name)) for each in (row, without)]
         cells = [cell(mean_turns(seed, world) for seed in each) for world in worlds for each in pair]
+        cells += [cell(mean_turns(seed, way) for seed in pair[0]) for way in ("ablated", "another")]
         lines.append([row.label, *cells, how(experiment, row, reports.get(row.name))])
     return lines
 
