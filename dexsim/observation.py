@@ -73,8 +73,8 @@ class ObservationField:
     size: Callable[[Hand, str], int]
     """How many values, for a hand and an encoding of orientations."""
     source: str
-    """Who measures it on a hand: "hand", "camera" or "imu"; "user" and "policy" know it themselves; "simulator" alone
-    knows the rest, which is for critics."""
+    """Who measures it on a hand: "hand", "camera" or "imu"; "user", "policy" and "mount" know it themselves; "simulator"
+    alone knows the rest, which is for critics."""
     compute: Callable[[Features], jax.Array]
     """Its values [size]."""
     scale: float | None = None
@@ -128,7 +128,7 @@ _FIELDS = (
     ("command", _fixed(1), "user", lambda f: f.readings.command[None], 0.5),
     ("last_action", _joints, "policy", lambda f: f.readings.last_action, 1.0),
     ("past_actions", lambda hand, _: 2 * hand.num_joints, "policy", lambda f: f.readings.past_actions.ravel(), 1.0),
-    ("palm_gravity", _fixed(3), "imu", lambda f: f.readings.palm_gravity, 1.0),
+    ("palm_gravity", _fixed(3), "mount", lambda f: f.readings.palm_gravity, 1.0),
     ("relative_orientation", _orientation, "imu", _relative_orientation, None),
     ("object_orientation", _orientation, "imu", lambda f: _encode(f, f.readings.object_quat), None),
     ("fingertip_velocity", _per_finger(6), "simulator", _fingertip_velocity, None),

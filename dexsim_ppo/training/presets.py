@@ -35,7 +35,6 @@ _CPU = Preset(
 # A gait is found on nearly nominal hands and widened: twice the turns of a training on the full ranges. What counts is
 # the goals of an episode: two goals and a stop end it early, so that their rate is that of a slow gait.
 _WIDENING = CurriculumConfig(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
-_FROM_MEMORY = ("rotate_without_orientation", "rotate_any")  # Touch tells the orientation over time only.
 PRESETS = {
     "cpu": _CPU,
     # 16 cores and more: enough environments for all of them. Sized from trainings of rotate on 2 to 12 cores.
@@ -88,7 +87,8 @@ def find_preset(name: str, task: str) -> Preset:
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
-        memory: Literal["none", "gru"] = "gru" if task in _FROM_MEMORY else "none"
+        # Touch tells an orientation over time only; of a cube, past actions tell as much as a memory.
+        memory: Literal["none", "gru"] = "gru" if task == "rotate_any" else "none"
         # The ranges of `rotate_any` are wide enough without extremes: four times the goals after 120 million steps.
         extremes = 0.0 if task == "rotate_any" else preset.extremes
         ppo = replace(ppo, num_envs=16384, memory=memory)
@@ -107,7 +107,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     if name != "auto" and name not in PRESETS:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     preset = find_preset(device_preset() if name == "auto" else name, task)
-    if task == "rotate" and preset.curriculum.on:  # Few steps: the first goals come after half as many without.
+    if preset.minutes and hasattr(env_config, "trap"):  # Few steps: the first goals come after half as many without.
         env_config = replace(env_config, trap=0.0)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.
         preset = replace(preset, extremes=0.0, ppo=replace(preset.ppo, memory="none"))

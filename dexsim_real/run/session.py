@@ -456,7 +456,7 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     if "camera" in needed and not (arguments.camera or arguments.fixed_object):
         raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
     reference = np.asarray(spec.reference, float)
-    objects = ObjectSensors(reference)
+    objects = ObjectSensors(spec.reference, spec.gravity)
     try:
         if arguments.camera:
             masks = open_masks(arguments.camera, arguments.optics)

@@ -10,7 +10,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -156,14 +156,22 @@ class ObjectEstimate(NamedTuple):
     position: np.ndarray  # [3] m
     velocity: np.ndarray  # [3] m/s
     quat: np.ndarray  # [4] (w, x, y, z)
-    palm_gravity: np.ndarray = np.zeros(3)  # [3]; zeros without an IMU
+    palm_gravity: np.ndarray = np.zeros(3)  # [3] unit vector
 
 
 class ObjectSensors:
-    """Camera and IMU, None without one. What neither measures is fixed: `reference` [3] m is the nominal position."""
+    """Camera and IMU, None without one. What neither measures is nominal: the position `reference` [3] m and the
+    direction of `gravity` [3] in the palm frame."""
 
-    def __init__(self, reference: np.ndarray, camera: HeightSensor | None = None, imu: ImuReader | None = None):
-        self._reference, self.camera, self.imu = np.asarray(reference, float), camera, imu
+    def __init__(
+        self,
+        reference: Sequence[float],
+        gravity: Sequence[float],
+        camera: HeightSensor | None = None,
+        imu: ImuReader | None = None,
+    ):
+        self._reference, self._down = np.asarray(reference, float), np.asarray(gravity) / np.linalg.norm(gravity)
+        self.camera, self.imu = camera, imu
 
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
@@ -182,7 +190,7 @@ class ObjectSensors:
         """The estimate, and the time in s of the newest orientation."""
         position, velocity = self.camera.read()[1:] if self.camera else (self._reference, np.zeros(3))
         if not self.imu:
-            return ObjectEstimate(position, velocity, IDENTITY), now
+            return ObjectEstimate(position, velocity, IDENTITY, self._down), now
         when, quat = self.imu.read()
         return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
 

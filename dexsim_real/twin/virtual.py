@@ -163,7 +163,7 @@ class VirtualRun:
         self.port = port = VirtualPort(plant)
         sensing = HandSensing(controller.hand, HardwareConfig(), ideal_calibration(controller.hand))
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
-        objects = ObjectSensors(np.asarray(controller.spec.reference, float))
+        objects = ObjectSensors(controller.spec.reference, controller.spec.gravity)
         objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
         objects.camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
         self.policy = PolicyLoop(

@@ -27,7 +27,7 @@ from dexsim_ppo.policy import load_policy
 SHIPPED = {
     "grasp": (GRASP, 66),
     "rotate": (ROTATE, 92),
-    "rotate_without_orientation": (ROTATE, 59),
+    "rotate_without_orientation": (ROTATE, 86),
     "rotate_clear": (ROTATE, 65),
 }
 

@@ -143,7 +143,7 @@ class RotateConfig(EnvConfig):
 
 
 _PLAIN = RotateConfig(trap=0.0, observation=ObservationConfig(), randomization=Randomization())
-"""Without what is known to help `rotate` alone."""
+"""Without what is known to help where a cube lies on the palm."""
 
 
 def paper() -> RotateConfig:
@@ -166,7 +166,9 @@ def paper() -> RotateConfig:
 
 def without_orientation() -> RotateConfig:
     """The paper's second policy: the object's orientation is not observed."""
-    return dataclasses.replace(_PLAIN, observation=ObservationConfig(leave_out=("relative_orientation",)))
+    config = RotateConfig()
+    observation = dataclasses.replace(config.observation, leave_out=("relative_orientation",))
+    return dataclasses.replace(config, observation=observation)
 
 
 def any_object() -> RotateConfig:

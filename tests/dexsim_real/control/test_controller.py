@@ -244,7 +244,7 @@ class Still:
 @pytest.mark.parametrize("silent", [False, True])
 def test_a_silent_imu_is_held_within_a_third_of_a_second_then_relaxed(hand, silent):
     bench, imu = Bench(hand), ImuReader()
-    objects = policy_loop.ObjectSensors(np.zeros(3), None, imu)
+    objects = policy_loop.ObjectSensors(np.zeros(3), (0.0, 0.0, -9.81), None, imu)
     loop = policy_loop.PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach_seconds=0, place_seconds=0)
     imu.receive(bench.now, encode(0, IDENTITY))
     bench.engage()

@@ -110,6 +110,7 @@ def test_velocity_from_differences():
 def test_who_measures_what():
     assert sources_of(GRASP) == {"hand", "camera", "user"}
     assert sources_of(ROTATE) == {"hand", "imu", "policy"}
+    assert "imu" not in sources_of(("palm_gravity",)), "without one the mount's nominal direction counts"
     with pytest.raises(HandError, match="no sensor measures"):
         sources_of(ROTATE_CRITIC)
 

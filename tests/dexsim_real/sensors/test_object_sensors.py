@@ -15,6 +15,7 @@ from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors
 from dexsim_real.sensors.imu import IDENTITY
 
 REFERENCE = np.array([0.055, -0.005, 0.09])  # m
+DOWN = (0.0, 0.0, -9.81)  # m/s^2
 
 
 def picture(point, config, radius=9, shape=(480, 640)):
@@ -129,7 +130,7 @@ def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():
     reader = imu.ImuReader()
     reader.receive(0.0, imu.encode(0, quat_of(0)))
     reader.calibrate(IDENTITY)
-    objects = ObjectSensors(np.zeros(3), None, reader)
+    objects = ObjectSensors(np.zeros(3), DOWN, None, reader)
     for tick in range(1, 101):
         turned = 0.01 * tick * 90  # degrees: 90 degrees in a second
         index, quat = tick, quat_of(turned)
@@ -161,7 +162,7 @@ def test_an_orientation_that_jumps_and_stays_is_noticed_within_a_tenth_of_a_seco
         reader.receive(time, imu.encode(tick, quat_of(math.degrees(0.003 * tick) + angle * (tick >= 40))))
         if tick == 0:
             reader.calibrate(IDENTITY)
-            objects = ObjectSensors(np.zeros(3), None, reader)
+            objects = ObjectSensors(np.zeros(3), DOWN, None, reader)
         if noticed is None and objects.lost(0.01 * tick, 0.3):
             noticed = tick
     assert noticed == (44 if angle > 23 else None)
@@ -221,10 +222,16 @@ def test_the_imu_thread_reads_a_port():
 
 def test_a_policy_waits_for_the_first_picture_and_not_for_a_camera_that_has_ended():
     camera = SimpleNamespace(has_measurement=False, failure="")
-    objects = ObjectSensors(np.zeros(3), camera, None)
+    objects = ObjectSensors(np.zeros(3), DOWN, camera)
     assert not objects.ready()
     camera.failure = "the camera sends no more pictures"
     with pytest.raises(HandError, match="no more pictures"):
         objects.ready()
     camera.has_measurement = True
-    assert objects.ready() and ObjectSensors(np.zeros(3), None, None).ready()
+    assert objects.ready() and ObjectSensors(np.zeros(3), DOWN).ready()
+
+
+def test_without_sensors_the_object_is_where_it_should_lie_and_the_palm_leans_as_it_should():
+    estimate, when = ObjectSensors(REFERENCE, (0.0, 3.0, -4.0)).read(2.5)
+    assert when == 2.5
+    np.testing.assert_allclose(np.concatenate(estimate), [*REFERENCE, *[0] * 3, *IDENTITY, 0.0, 0.6, -0.8])
