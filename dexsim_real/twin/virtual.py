@@ -164,7 +164,8 @@ class VirtualRun:
         sensing = HandSensing(controller.hand, HardwareConfig(), ideal_calibration(controller.hand))
         self.loop = ExchangeLoop(port, sensing, self.safety, RATE, clock=port.clock, sleep=port.sleep)
         objects = ObjectSensors(controller.spec.reference, controller.spec.gravity)
-        objects.imu = virtual_imu(port, plant.seed) if "imu" in controller.sources else None
+        # Who mounts a hand measures how it leans, here as well as the object's IMU does.
+        objects.imu = virtual_imu(port, plant.seed) if controller.sources & {"imu", "mount"} else None
         objects.camera = virtual_camera(port, controller.spec) if "camera" in controller.sources else None
         self.policy = PolicyLoop(
             controller, self.safety, objects, command=self.command, approach_seconds=_APPROACH, place_seconds=_PLACE
