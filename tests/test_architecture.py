@@ -48,7 +48,7 @@ FLOORS = {
         ("wire",),
         ("sensors",),
         ("control",),
-        ("loop",),
+        ("loop", "status"),
         ("run", "replay", "calibrate"),
         ("ros",),
         ("twin.plant",),

@@ -19,16 +19,16 @@ from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import Config, from_dict, setting, to_dict
 from dexsim.hand.description import Hand
+from dexsim_real.control.controller import smooth
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import smooth
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter, Record, reading
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.loop import ExchangeLoop, LoopOptions
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.link import UNCONFIRMED, HandPort, Identity
-from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 _READING = re.compile(r"([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*(n|g|kg|)", re.IGNORECASE)

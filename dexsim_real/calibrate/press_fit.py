@@ -28,8 +28,7 @@ from dexsim.hand.description import Hand
 from dexsim_real.calibrate.bench import Source, read_logs
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING
 from dexsim_real.core.log import Kind, Record
-from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.taxels import around, taxel_names
+from dexsim_real.sensors.hand import HandSensing, around, taxel_names
 
 Scale = tuple[float, float, float]
 """Of a press's taxel counts: N per count, N without counts, and the share (95 %) by which the first may be wrong."""
@@ -337,8 +336,7 @@ def repaired(hand: Hand, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     did: they get the mean of their working neighbours. What reads next to nothing far from the press becomes 0."""
     largest = counts.max(0, keepdims=True)
     pressed, beside = largest >= _ACTIVE, around(hand, largest >= _ACTIVE)
-    dead = (largest <= 0) & (beside.sum(0) >= around(hand, np.ones(largest.shape)).sum(0) / 2)
+    dead = (largest <= 0) & (beside >= around(hand, np.ones(largest.shape)) / 2)
     working = np.where(dead, 0.0, 1.0)
-    total, near = around(hand, counts * working).sum(0), around(hand, working).sum(0)
-    filled = np.where(dead, total / np.maximum(near, 1), counts)
-    return np.where(pressed | beside.any(0), filled, 0.0), dead[0]
+    filled = np.where(dead, around(hand, counts * working) / np.maximum(around(hand, working), 1), counts)
+    return np.where(pressed | (beside > 0), filled, 0.0), dead[0]

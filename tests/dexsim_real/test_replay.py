@@ -10,9 +10,8 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
 from dexsim.core.errors import DexsimError
-from dexsim_real import replay
+from dexsim_real import replay, run
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
-from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim_real.twin.wire.firmware import Terminal
+from dexsim_real.twin.wire import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HOST_REQUESTS, Command, Frame, Parser
 from dexsim_real.wire.link import LinkConfig

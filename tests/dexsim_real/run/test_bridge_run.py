@@ -25,16 +25,14 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.hand.source import recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real import replay
-from dexsim_real.control.controller import Controller
+from dexsim_real import replay, run, status
+from dexsim_real.control.controller import Controller, limits_for
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.loop import TARE_SAMPLES
-from dexsim_real.run import __main__ as run, session, status
-from dexsim_real.run.session import Outcome
+from dexsim_real.run import Outcome
 from dexsim_real.sensors.camera import encode_mask
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.virtual import ideal_calibration
@@ -233,7 +231,7 @@ def test_a_run_ends_when_its_exchange_thread_has_failed():
 
     parts = SimpleNamespace(loop=SimpleNamespace(check=fail), safety=SimpleNamespace(latched=""))
     with pytest.raises(HandError, match="the exchange thread failed"):
-        session.Session._check(parts)
+        run.Session._check(parts)
 
 
 def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
@@ -442,6 +440,6 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
             error = SimpleNamespace(write=lambda text: os.write(master, b"n\n"), flush=lambda: None)
             monkeypatch.setattr("sys.stderr", error)
             with pytest.raises(HandError, match="the motors stayed off"):
-                session.ask()
+                run.ask()
     finally:
         os.close(master)

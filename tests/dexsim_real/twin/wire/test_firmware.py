@@ -13,7 +13,7 @@ from twin_plant import ScriptedPlant
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
-from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
+from dexsim_real.twin.wire import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, check_identity, read_identity

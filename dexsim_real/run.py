@@ -1,6 +1,10 @@
-"""A run on the hand: connect, tare, approach, run the policy, and end with the motors off.
+"""Runs a policy on the hand: connects, tares, approaches, runs the policy, and ends with the motors off.
 
-`run_policy` is a whole run as one call, for programs and notebooks; `python -m dexsim_real.run` is the same call.
+    python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
+
+The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The program
+asks before the motors come on (`--yes` does not). They come on at the measured pose, and go off at the end of the
+program, even after a failure. `run_policy` is the same as one call, for programs and notebooks.
 """
 
 import contextlib
@@ -10,6 +14,7 @@ import hashlib
 import sys
 import termios
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,20 +29,19 @@ from dexsim.core import cli
 from dexsim.core.config import setting, to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller, Tick, prepare_jax
+from dexsim_real.control.controller import Controller, PolicyLoop, Tick, limits_for, prepare_jax
 from dexsim_real.control.guard import Guard
-from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
 from dexsim_real.loop import LoopOptions, LoopThread, Pace, Timing, keep_phase
-from dexsim_real.run.status import StatusView, hand_tables
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.sensors.imu import UPRIGHT_X, Imu
+from dexsim_real.status import StatusView, hand_tables, show_summary
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.link import UNCONFIRMED
-from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
 _QUESTION = (
@@ -156,7 +160,6 @@ def execute(arguments: RunArguments) -> RunResult:
     reason, code = "", 0
     try:
         try:
-            session.prepare()
             session.run()
         except HandError as error:
             reason, code = str(error), 1
@@ -214,7 +217,7 @@ class Outcome:
 
 
 class Session:
-    """A run: the constructor opens only files, `prepare` connects with the motors off, `run` turns them on.
+    """A run: the constructor opens only files, `run` connects.
 
     Raises DexsimError: the policy, calibration or log cannot be used.
     """
@@ -240,7 +243,7 @@ class Session:
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, guard)
         self.loop.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self._hand_tables, arguments.quiet)
-        self.policy: PolicyLoop | None = None  # from `prepare` on
+        self.policy: PolicyLoop | None = None  # once the hand is connected
         self.pace = Pace(policy.control_rate)
         self.started = 0.0
         self.outcome = Outcome()
@@ -249,10 +252,11 @@ class Session:
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
-    def prepare(self) -> None:
-        """Connect with the motors off, tare the taxels, start camera and IMU.
+    def run(self) -> None:
+        """Connect with the motors off and tare, ask, turn the motors on, approach the start posture, and run the policy
+        until time or `Safety` ends it.
 
-        Raises HandError: something is missing or does not answer.
+        Raises HandError: something is missing, the answer was not yes, or `Safety` or a failure ended the run.
         """
         arguments, sensing = self.arguments, self.sensing
         for line in self.port.greet(sensing.hand, sensing.calibration):
@@ -262,7 +266,7 @@ class Session:
         self._write_meta()
         self.loop.start()
         self._await_pose()
-        self.policy = PolicyLoop(
+        self.policy = policy = PolicyLoop(
             self.controller,
             self.safety,
             open_objects(arguments, self.controller),
@@ -271,14 +275,7 @@ class Session:
             place_seconds=arguments.place,
             motors_off=arguments.motors_off,
         )
-
-    def run(self) -> None:
-        """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
-
-        Raises HandError: the answer was not yes, or `Safety` or a failure ended the run.
-        """
-        assert self.policy is not None, "`prepare` comes first"
-        if not (self.arguments.yes or self.arguments.motors_off):
+        if not (arguments.yes or arguments.motors_off):
             self.view.show()
             ask()
             self._await_pose()  # The hand may have been moved or lost meanwhile.
@@ -286,16 +283,16 @@ class Session:
         gc.collect()
         gc.freeze()
         with self.view:
-            if not self.arguments.motors_off:
+            if not arguments.motors_off:
                 self.loop.engage()
                 self._await_motors()
-            pace = Pace(self.arguments.rate)
-            while self.policy.approach(time.monotonic()):
+            pace = Pace(arguments.rate)
+            while policy.approach(time.monotonic()):
                 self._check()
                 pace.wait()
-            self.policy.begin()
+            policy.begin()
             self._note("the policy starts")
-            self._run_policy(self.policy)
+            self._run_policy(policy)
             self.end = "time is over"
 
     def close(self, reason: str = "") -> None:
@@ -468,3 +465,26 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         objects.close()
         raise
     return objects
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run or something is missing."""
+    arguments = cli.parse(RunArguments, argv, prog="python -m dexsim_real.run", description="Run a policy on the hand.")
+    inputs = {"policy": arguments.policy, "calibration": arguments.calibration, "TOML of the hand": arguments.hand}
+    cli.check_no_overwrite({"--log": arguments.log, "--output": arguments.output}, inputs)
+    if arguments.output:
+        cli.check_writable(arguments.output)
+    with stopping(leaving=argv is None):
+        result = execute(arguments)
+        if result.problem:
+            with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
+                print(f"error: {result.problem}", file=sys.stderr)
+        if not arguments.quiet:
+            show_summary(f"{arguments.policy}: {result.end}", result.summary)
+        if arguments.output:
+            cli.write_json(arguments.output, result.summary)
+    return result.code
+
+
+if __name__ == "__main__":
+    cli.run(main)
