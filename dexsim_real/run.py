@@ -386,7 +386,8 @@ class Session:
             if tick is not None:
                 self.newest = tick
                 fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
-                fields |= {"sequence": policy.sample.sequence, "age": now - policy.sample.time}
+                sample = policy.sample
+                fields |= {"sequence": sample.sequence, "age": now - sample.time, "answer": sample.state.tobytes()}
                 self.log.add(Kind.TICK, fields | {"readings": vars(tick.readings)}, now)
             self.pace.wait()
         self._check()

@@ -198,7 +198,6 @@ class Bench(ExchangeLoop):
     an exchange and returns its result. The taxels' zeros stay as they were tared: what they read is measured.
 
     Args:
-      task: "calibrate" or "identify", written to the log with the configuration.
       port: replaces the port that the arguments name.
       clock: `clock` and `sleep` of `ExchangeLoop`, for simulated time.
     """
@@ -208,12 +207,11 @@ class Bench(ExchangeLoop):
         arguments: CalibrateArguments,
         hand: Hand,
         operator: Operator,
-        task: str,
         *,
         port: HandPort | None = None,
         **clock: Any,
     ):
-        self.arguments, self.operator, self._task = arguments, operator, task
+        self.arguments, self.operator = arguments, operator
         port = port or open_port(str(arguments.port), hand, arguments.link)
         if not arguments.identify and (lacking := [name for name in port.missing if name != "temperatures"]):
             raise HandError(f"presses need taxels and currents, and the hand has no {lacking[0]}: --identify")
@@ -235,8 +233,9 @@ class Bench(ExchangeLoop):
             for line in self.port.greet(hand, calibration):
                 self._say(line)
             meta = {name: to_dict(getattr(arguments, name)) for name in ("hardware", "safety", "press")}
-            meta |= {"task": self._task, "rate": arguments.rate, "identity": tuple(self.port.identity)}
-            self.log.add(Kind.META, meta | {"clock": time.time(), "environment": cli.environment_report()})
+            meta |= {"task": "identify" if arguments.identify else "calibrate", "rate": arguments.rate}
+            meta |= {"identity": tuple(self.port.identity), "environment": cli.environment_report()}
+            self.log.add(Kind.META, meta | {"clock": time.time()})
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise

@@ -230,27 +230,12 @@ class HandSensing:
         return np.sqrt(sum(taxel[axis].astype(np.float32) ** 2 for axis in "xyz"))
 
 
-class VelocityFilter:
-    """Joint velocities [J] rad/s: differences of the joint angles through a first-order filter."""
-
-    def __init__(self, joints: int):
-        self._last: tuple[float, np.ndarray] | None = None
-        self.velocity = np.zeros(joints, np.float32)
-
-    def estimate(self, time: float, position: np.ndarray) -> np.ndarray:
-        """Velocities [J] rad/s if this measurement [J] rad at a time in s were kept."""
-        if self._last is None or time <= self._last[0]:
-            return self.velocity
-        step = time - self._last[0]
-        weight = step / (step + _VELOCITY_TIME)
-        rate = (position - self._last[1]) / step
-        return (self.velocity + weight * (rate - self.velocity)).astype(np.float32)
-
-    def update(self, time: float, position: np.ndarray) -> np.ndarray:
-        """Keep a measurement [J] rad at a time in s; returns the velocities [J] rad/s after it."""
-        self.velocity = self.estimate(time, position)
-        self._last = time, position
-        return self.velocity
+def filtered_velocity(velocity: np.ndarray, moved: np.ndarray, seconds: float) -> np.ndarray:
+    """Joint velocities [J] rad/s by a first-order filter, from those before and the motion [J] rad in a time in s."""
+    if seconds <= 0:
+        return velocity
+    weight = seconds / (seconds + _VELOCITY_TIME)
+    return (velocity + weight * (moved / seconds - velocity)).astype(np.float32)
 
 
 # --- taxels at rest and in a run --------------------------------------------------------------------

@@ -42,7 +42,7 @@ def test_the_bridges_camera_sees_the_object(tmp_path):
     with Running(tmp_path, task="grasp", seed=3) as running:
         masks = open_masks(f"unix:{running.twin.sensor.path}", OPTICS)
         sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
-        while not sensor.has_measurement or running.twin.sensor.sent < 10:
+        while sensor.newest is None or running.twin.sensor.sent < 10:
             time.sleep(0.01)
         when, position, _ = sensor.read()
         assert position[0] == pytest.approx(0.047, abs=0.002) and when <= time.monotonic()
