@@ -207,14 +207,11 @@ def draw_losses(folder: Path, hand: Hand, reports: list[dict[str, Any]]) -> list
         if "before" not in report or path in paths:
             continue
         parts, before = report["parts"], report["before"]
-        size = np.zeros((len(parts), 3))
-        for row, part in zip(size, parts, strict=True):
-            row[: len(part["size"])] = part["size"]
         snapshot = Snapshot(
             joint_position=np.array(before["joint_position"]),
             object_position=np.array(before["object_position"]),
             object_rotation=matrix(np.array(before["object_quat"])),
-            primitive_size=size,
+            primitive_size=np.array([(*part["size"], 0, 0)[:3] for part in parts]),
             primitive_position=np.array([part["place"] for part in parts]),
             primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
             primitive_active=np.ones(len(parts), bool),

@@ -270,7 +270,7 @@ class Bench(ExchangeLoop):
             self.safety.set_target(target, now)
         sample = self.cycle()
         answer = b"" if sample is None else sample.state.tobytes()
-        self._newest = {"sent": now, "command": self.command.tobytes(), "answer": answer}
+        self._newest = {"sent": now, "command": self.command["position"].copy(), "answer": answer}
         self._check(now, sample)
         self.pace.wait()
         return None if self.safety.problem else sample

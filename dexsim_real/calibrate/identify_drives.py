@@ -25,7 +25,6 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire import frames
 from dexsim_real.wire.link import check_identity
 
 Marks = list[dict[str, Any]]
@@ -151,7 +150,7 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
         found = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
         raise LogError(f"exchanges took {found}: set the adapter's latency timer to 1 ms, or lower --rate")
     sensing, rows = HandSensing(hand, source.hardware, calibration), np.arange(len(marks))
-    commands = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
+    commands = np.array([mark["command"] for mark in marks])
     answers = [sensing.measure(sensing.decode(mark["answer"])) for mark in marks if mark["measured"]]
     position, share = np.array([(answer.joint_position[joint], answer.joint_torque[joint]) for answer in answers]).T
     # Few samples are missing: interpolate them.

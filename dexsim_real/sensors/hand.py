@@ -138,7 +138,7 @@ class HandSensing:
         """A logged state: of the XHand's wire, or of a driver. HandError: it is of another hand."""
         for block in (self.block, frames.STATE_BLOCK):
             if len(data) == block.itemsize:
-                return frames.decode_state(data, block)
+                return frames.decode(data, block)
         raise HandError(f"expected states of {self.hand.name}, got {len(data)} bytes: give the log's hand with --hand")
 
     def measure(self, state: np.ndarray) -> HandMeasurement:

@@ -27,7 +27,7 @@ from dexsim_real.sensors.imu import BAUD, ImuReader
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire import CAMERA_RATE, FORCE_PER_COUNT, IMU_RATE, Firmware, ImuFrames, picture
-from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
+from dexsim_real.wire.frames import HOST, Command, Frame, decode, palm_address
 from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, LinkCounts, Reply
 
 RATE = 83.0  # exchanges a second
@@ -79,7 +79,7 @@ class VirtualPort(HandPort):
         self.wait_until(sent + ROUND_TRIP)
         self.counts.sent += 1
         self.counts.answered += 1
-        return Reply(decode_state(answer.data), sent, self.time, self.counts.sent, generation=1)
+        return Reply(decode(answer.data), sent, self.time, self.counts.sent, generation=1)
 
     def clock(self) -> float:
         """Virtual time in s."""

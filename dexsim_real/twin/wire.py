@@ -108,7 +108,7 @@ class Firmware:
         if command != Command.EXCHANGE:
             return _PARAMETER
         try:
-            block = frames.decode_command(data)
+            block = frames.decode(data, frames.COMMAND_BLOCK)
         except frames.FrameError:
             return _ID
         if not np.isin(block["mode"], list(Mode)).all():

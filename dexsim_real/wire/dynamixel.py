@@ -1,17 +1,9 @@
 """A driver for hands of Dynamixel motors, such as the LEAP Hand's sixteen XL330 or XC330: protocol 2.0 on pyserial.
 
-A file of your own tells port and motors, in the order of the joints in the hand's TOML; for `leap_like`:
-
-    # my_leap.py, for --port sdk:my_leap
-    from dexsim_real.wire.dynamixel import DynamixelHand
-
-    def open_hand(hand, link):
-        ids = [12, 13, 14, 15, 1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11]
-        return DynamixelHand("/dev/serial/by-id/...", ids, baud=4_000_000)
-
-Motors run in the current-based position mode: `--hardware.torque-max` is their goal current in mA, `--hardware.kp`,
-`ki` and `kd` are the registers of the position gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in
-the maker's tools. Packets, checksum and registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
+A file of your own tells port and motors (docs/bridge.md). They run in the current-based position mode:
+`--hardware.torque-max` is their goal current in mA, `--hardware.kp`, `ki` and `kd` are the registers of the position
+gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in the maker's tools. Packets, checksum and
+registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
 """
 
 import time

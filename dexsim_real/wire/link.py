@@ -348,7 +348,7 @@ class SerialHand(HandPort):
         if frame is None:
             return None
         try:
-            state = frames.decode_state(frame.data)
+            state = frames.decode(frame.data)
         except frames.FrameError:
             self.counts.answered -= 1
             self.counts.corrupt += 1

@@ -78,7 +78,7 @@ class PtyHand:
             return whole and Frame(0x80, 0xFE, Command.READ_REGISTER, whole).encode()
         if frame.command != Command.EXCHANGE:
             return b""
-        command = frames.decode_command(frame.data)
+        command = frames.decode(frame.data, frames.COMMAND_BLOCK)
         self.commands.append(command)
         custom = self.answer(len(self.commands) - 1, command, self.state) if self.answer else None
         return self.whole() if custom is None else custom

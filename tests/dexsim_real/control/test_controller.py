@@ -123,7 +123,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         seen = ObjectEstimate(rng.normal(size=3), rng.normal(size=3), quats[0])
         data = random_state(rng, hand).tobytes()
-        tick = controller.tick(sensing.measure(frames.decode_state(data)), seen, quats[1], 0.37)
+        tick = controller.tick(sensing.measure(frames.decode(data)), seen, quats[1], 0.37)
         simulated = np.asarray(door(tick.readings, goal))
         assert simulated.dtype == tick.observation.dtype == np.float32
         assert simulated.tobytes() == tick.observation.tobytes()

@@ -93,7 +93,7 @@ def test_temperatures_and_error_bits_are_of_the_right_boards(hand):
     for joint in range(12):
         for board in range(3):
             data[24 * joint + 12 + 2 * board] = 16 * board + joint + 1
-    measured = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data)))
+    measured = HandSensing(hand, HardwareConfig()).measure(frames.decode(bytes(data)))
     np.testing.assert_array_equal(measured.temperature, [56] * 12 + [33] * 5 + [41])
     np.testing.assert_array_equal(measured.errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
 
