@@ -48,7 +48,7 @@ FLOORS = {
         ("wire",),
         ("sensors",),
         ("control",),
-        ("loop", "status"),
+        ("loop",),
         ("run", "replay", "calibrate"),
         ("ros",),
         ("twin.plant",),
