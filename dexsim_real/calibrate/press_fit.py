@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
@@ -255,11 +256,9 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
 
 def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
-    size, count = np.abs(current), run.max() + 1
-    highest = np.zeros(count)
-    np.maximum.at(highest, run, size)
-    top = size > _TOP * highest[run]
-    return top & (np.bincount(run, top, count) >= _TOP_BLOCKS)[run]
+    size = np.abs(current)
+    top = size > _TOP * ndimage.maximum(size, run, run)
+    return top & (ndimage.sum_labels(top, run, run) >= _TOP_BLOCKS)
 
 
 def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str, JointFit]) -> np.ndarray:
