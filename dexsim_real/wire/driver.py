@@ -102,21 +102,15 @@ class DriverPort(HandPort):
         """One line for each thing that this hand does not measure."""
         return [WITHOUT[name] for name in self.missing]
 
-    def connect(self) -> str:
-        try:
-            line = self.driver.connect()
-        except OSError as error:
-            raise HandError(f"the hand cannot be reached ({error}); check cable and power") from None
-        self._connected = True
-        self._generation += 1
-        return line
-
     def close(self) -> None:
         self._connected = False
         self.driver.close()
 
-    def _reopen(self) -> None:
-        self.connect()
+    def _connect(self, again: bool = False) -> str:
+        line = self.driver.connect()
+        self._connected = True
+        self._generation += 1
+        return line
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1

@@ -238,7 +238,13 @@ class HandPort:
 
         Raises HandError: the port cannot be opened, or the hand does not answer.
         """
-        raise NotImplementedError
+        try:
+            return self._connect()
+        except (OSError, HandError) as error:
+            self.close()
+            if isinstance(error, HandError):
+                raise
+            raise HandError(f"the hand cannot be reached ({error}); check cable and power") from None
 
     def exchange(self, command: np.ndarray) -> Reply | None:
         """Send joint commands (`frames.command_block`); None when no valid answer arrived in time.
@@ -254,7 +260,7 @@ class HandPort:
                     self._sleep(_PAUSE)
                     return None
                 try:
-                    self._reopen()
+                    self._connect(again=True)
                 except HandError as error:
                     raise OSError from error
                 self.counts.reconnects += 1
@@ -289,8 +295,8 @@ class HandPort:
         """One exchange on an open line. OSError: the line failed."""
         raise NotImplementedError
 
-    def _reopen(self) -> None:
-        """Open the line to the hand that was there before. OSError or HandError: it is still gone."""
+    def _connect(self, again: bool = False) -> str:
+        """Open the line, `again` to the hand that was there before. OSError or HandError: it cannot be reached."""
         raise NotImplementedError
 
 
@@ -307,21 +313,6 @@ class SerialHand(HandPort):
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
-
-    def connect(self) -> str:
-        """Open the port and identify the hand; see `HandPort.connect`."""
-        self._open()
-        try:
-            self._sleep(self.config.settle)
-            version = self._handshake(self.config.handshake)
-            self.identity = self._read_identity()
-        except HandError:
-            self.close()
-            raise
-        except OSError as error:
-            self.close()
-            raise HandError(f"{self.port}: the connection failed in the handshake ({error}); check the cable") from None
-        return f"{self.port}: hand {self.config.hand_id}, {self.identity}, firmware {version}"
 
     def close(self) -> None:
         self._connected = False
@@ -427,6 +418,19 @@ class SerialHand(HandPort):
 
     # --- opening and reopening --------------------------------------------------------------
 
+    def _connect(self, again: bool = False) -> str:
+        self._open()
+        if not again:
+            self._sleep(self.config.settle)
+        version = self._handshake(0.0 if again else self.config.handshake)
+        if not again:
+            self.identity = self._read_identity()
+        elif self.identity != Identity() and (identity := self._read_identity()) != self.identity:
+            text = f"another hand is on {self.port}: {identity}, not {self.identity}"
+            self.refusal = Refusal(text, serious=True)
+            raise OSError(text)
+        return f"{self.port}: hand {self.config.hand_id}, {self.identity}, firmware {version}"
+
     def _open(self) -> None:
         self.close()
         self._serial = open_serial(self.port, self.config.baud, timeout=_POLL, write_timeout=_WRITE)
@@ -479,11 +483,3 @@ class SerialHand(HandPort):
             what = f"{counts.crc_errors} wrong checksums, {counts.refused} refusals"
             why = f"no valid state ({what}); check cable, termination and --link.hand-id (now {config.hand_id})"
         return f"{self.port}: {why}"
-
-    def _reopen(self) -> None:
-        self._open()
-        self._handshake(0.0)
-        if self.identity != Identity() and (identity := self._read_identity()) != self.identity:
-            text = f"another hand is on {self.port}: {identity}, not {self.identity}"
-            self.refusal = Refusal(text, serious=True)
-            raise OSError(text)
