@@ -68,7 +68,6 @@ class Trace:
     """What a motion was, [T, B, ...] each, at the end of every control tick."""
 
     place: np.ndarray  # [3] m
-    quat: np.ndarray  # [4]
     force: np.ndarray  # [F + 1, 3] N: on each finger at that moment, and on the object by the hand, mean of the tick
 
 
@@ -248,14 +247,12 @@ class Motions:
         velocity = np.concatenate([np.asarray(begin.state.qvel)[None], qvel])[..., physics.object_dof[:3]]
         acceleration = np.diff(velocity, axis=0) / self.env.control_period - np.asarray(self.env.task.gravity)
         on_object = np.asarray(begin.object.mass)[:, None] * acceleration - np.asarray(begin.push)
-        place, quat = np.split(qpos[..., physics.object_qpos], [3], -1)
-        return Trace(place, quat, np.concatenate([finger_force, on_object[:, :, None]], 2))
+        place = qpos[..., physics.object_qpos[:3]]
+        return Trace(place, np.concatenate([finger_force, on_object[:, :, None]], 2))
 
     def compare(self, found: Trace, wanted: Trace) -> list[dict[str, Any]]:
         """A row for each motion and shape: how far an engine's motions are from others."""
         place = 1e3 * np.linalg.norm(found.place - wanted.place, axis=-1)
-        chord = np.minimum(*(np.linalg.norm(found.quat - sign * wanted.quat, axis=-1) for sign in (1, -1)))
-        turn = np.degrees(4 * np.arcsin(np.minimum(chord / 2, 1)))
         force, strength = np.linalg.norm(found.force - wanted.force, axis=-1), np.linalg.norm(wanted.force, axis=-1)
         touching, rows = np.maximum(strength, np.linalg.norm(found.force, axis=-1)) > TOUCHING, []
         for motion, shape in dict.fromkeys(self.cases):
@@ -263,11 +260,7 @@ class Motions:
             row: dict[str, Any] = {"task": self.task, "motion": motion, "shape": shape, "n": sum(mine)}
             touched = touching[:, mine]
             row["force_n"] = float(strength[:, mine][touched].mean())
-            for name, values in (
-                ("place_mm", place[:, mine]),
-                ("turn_deg", turn[:, mine]),
-                ("force_error_n", force[:, mine][touched]),
-            ):
+            for name, values in (("place_mm", place[:, mine]), ("force_error_n", force[:, mine][touched])):
                 row |= {f"{name}_p95": float(np.percentile(values, 95)), f"{name}_max": float(values.max())}
             rows.append(row)
         return rows

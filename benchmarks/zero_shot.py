@@ -207,14 +207,11 @@ def draw_losses(folder: Path, hand: Hand, reports: list[dict[str, Any]]) -> list
         if "before" not in report or path in paths:
             continue
         parts, before = report["parts"], report["before"]
-        size = np.zeros((len(parts), 3))
-        for row, part in zip(size, parts, strict=True):
-            row[: len(part["size"])] = part["size"]
         snapshot = Snapshot(
             joint_position=np.array(before["joint_position"]),
             object_position=np.array(before["object_position"]),
             object_rotation=matrix(np.array(before["object_quat"])),
-            primitive_size=size,
+            primitive_size=np.array([(*part["size"], 0, 0)[:3] for part in parts]),
             primitive_position=np.array([part["place"] for part in parts]),
             primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
             primitive_active=np.ones(len(parts), bool),
@@ -287,22 +284,20 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--task", choices=TASKS, required=True)
     add("--policy", help="policy file; by default the shipped policy of the task")
     add("--hand", default="", help="TOML or name of a hand with the XHand's joints and taxels")
-    add("--trials", type=_whole(1), default=10, help="of each seed")
-    add("--seed", type=_whole(0), nargs="+", default=[0], help="the metrics are over the trials of all seeds")
+    add("--trials", type=int, default=10, help="of each seed")
+    add("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")
     add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside training's ranges, or in")
     add("--plant-model", metavar="FILE", help="MJCF of another hand (docs/emulated_hand.md)")
     add("--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter")
     add("--limit", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="a safety limit of the bridge")
     add("--no-baseline", dest="baseline", action="store_false", help="no trials of a hand that does nothing")
-    add("--processes", type=_whole(1), default=1, help="trials at once")
-    add("--first", type=_whole(0), default=0, help="number of the first trial")
+    add("--processes", type=int, default=1, help="trials at once")
+    add("--first", type=int, default=0, help="number of the first trial")
     add("--json", type=Path, help="file for all results")
     add("--pictures", type=Path, metavar="FOLDER", help="for a picture of each cause of a loss")
     given = parser.parse_args(argv)
     given.set, given.limit, given.policy = dict(given.set), dict(given.limit), given.policy or given.task
-    if given.seconds is not None and not 0.0 < given.seconds < np.inf:
-        parser.error(f"--seconds {given.seconds:g}: must be a time above 0 s")
     sample_trial(given.task, np.random.default_rng(0), given.parameters, given.set)
     if unknown := given.limit.keys() - vars(SafetyConfig()):
         parser.error(f"--limit: the bridge has no limit {sorted(unknown)[0]!r}")
@@ -312,15 +307,6 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     prepare_jax()  # As the trials need it, before anything is computed.
     load_policy(given.policy, task=given.task)
     return given
-
-
-def _whole(low: int) -> Any:
-    def number(text: str) -> int:
-        if (value := int(text)) < low:
-            raise argparse.ArgumentTypeError(f"{value}: must be at least {low}")
-        return value
-
-    return number
 
 
 def _pair(text: str) -> tuple[str, float]:

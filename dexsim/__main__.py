@@ -21,7 +21,7 @@ COMMANDS = {
     "view": ("dexsim.view.__main__", "the same, of a policy, task or log of your own"),
     "export": ("dexsim_ppo.export", "write a policy as an ONNX model or a bundle"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
-    "run": ("dexsim_real.run.__main__", "run a policy on the hand"),
+    "run": ("dexsim_real.run", "run a policy on the hand"),
     "ros": ("dexsim_real.ros", "a hand as a ROS 2 node"),
     "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
     "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),

@@ -13,13 +13,14 @@ if TYPE_CHECKING:
     from dexsim_real.control.limits import SafetyConfig as SafetyConfig
     from dexsim_real.control.safety import Safety as Safety
     from dexsim_real.core.errors import HandError as HandError
-    from dexsim_real.run.session import RunResult as RunResult, run_policy as run_policy
+    from dexsim_real.run import RunResult as RunResult, run_policy as run_policy
     from dexsim_real.wire.driver import (
         DriverState as DriverState,
         HandDriver as HandDriver,
         JointTargets as JointTargets,
+        open_port as open_port,
     )
-    from dexsim_real.wire.link import LinkConfig as LinkConfig
-    from dexsim_real.wire.serial_hand import SerialHand as SerialHand, open_port as open_port
+    from dexsim_real.wire.link import LinkConfig as LinkConfig, SerialHand as SerialHand
+
 
 __all__, __getattr__, __dir__ = lazy_exports(__name__)

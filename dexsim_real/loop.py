@@ -20,7 +20,7 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import EXCHANGE, change_priority, ignore_signals
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig, filtered_velocity
 from dexsim_real.wire.frames import Mode, passive_command
 from dexsim_real.wire.link import BRIEF, PATIENCE, HandPort, LinkConfig, Reply
 
@@ -69,7 +69,6 @@ class ExchangeLoop:
         self.command = passive_command(self.sensing.hand.num_joints)  # the newest that was sent
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
-        self._generation: int | None = None
         self._engage = False
 
     def engage(self) -> None:
@@ -94,8 +93,7 @@ class ExchangeLoop:
         self.driven = on
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)
-        if self.safety.update(sample):
-            self._filter.update(sample.time, sample.measured.joint_position)
+        self.safety.update(sample)
         return sample
 
     def tare(self) -> list[str]:
@@ -145,10 +143,10 @@ class ExchangeLoop:
             if changed or lines:
                 self.retared(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
-        if reply.generation != self._generation:
-            self._filter = VelocityFilter(self.sensing.hand.num_joints)
-        self._generation = reply.generation
-        velocity = self._filter.estimate(reply.received, measured.joint_position)
+        last, velocity = self.safety.sample, np.zeros(self.sensing.hand.num_joints, np.float32)
+        if last is not None and last.generation == reply.generation:
+            moved = measured.joint_position - last.measured.joint_position
+            velocity = filtered_velocity(last.velocity, moved, reply.received - last.time)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity, reply.state)
 
 

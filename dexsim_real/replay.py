@@ -1,10 +1,9 @@
-"""Recomputes the log of a run, checks every observation against the recorded frames, and writes what is asked for.
+"""Recomputes the log of a run, checks every observation, and writes what is asked for.
 
     python -m dexsim_real.replay runs/real/....log --plot run.png
 
-Joint angles, torques and taxel forces are recomputed from the frame that each tick used, and the observation from the
-readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit, and those whose
-frame is missing: they are not recomputed.
+Joint angles, torques and taxel forces are recomputed from the hand's answer that each tick used, and the observation
+from the readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit.
 """
 
 import dataclasses
@@ -29,9 +28,6 @@ from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.controller import make_observe, prepare_jax
 from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
-from dexsim_real.wire import frames
-
-_KEPT = 50  # newest frames, of which a tick used one
 
 
 class Replay:
@@ -78,9 +74,8 @@ class Replay:
         self.fields = layout(self.hand, spec.fields, spec.observation)
         self._observe = make_observe(calibrated_hand(self.hand, calibration), spec.fields, spec.observation)
         self.report = {"log": str(path)} | {name: meta[name] for name in ("task", "policy")}
-        self.report |= dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
+        self.report |= dict.fromkeys(("frames", "readings_same", "observations_same"), 0)
         self.report |= {"first_difference": None, "ended": "truncated", "recorded_on": meta["environment"]}
-        self._states: dict[int, bytes] = {}
         self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
 
     def _add(self, record: Record) -> None:
@@ -89,23 +84,16 @@ class Replay:
         if record.kind == Kind.META:
             self._tares.append((content["from"], content["tare"]))
         elif record.kind == Kind.RECEIVED:
-            number, frame = content
             report["frames"] += 1
-            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
-                self._states[number] = frame
-                self._states.pop(number - _KEPT, None)
         elif record.kind == Kind.TICK:
-            frame = self._states.get(content["sequence"])
-            report["without_frame"] += frame is None
-            if frame is not None:
-                self._compare(record.time, content, frame)
+            self._compare(record.time, content)
         elif record.kind == Kind.END:
             report["ended"] = content["end"]
 
-    def _compare(self, time: float, tick: dict[str, Any], frame: bytes) -> None:
+    def _compare(self, time: float, tick: dict[str, Any]) -> None:
         # The exchange thread may have changed the tare before the tick's record was written.
         self._sensing.tare = next(tare for begin, tare in reversed(self._tares) if begin <= tick["sequence"])
-        measured = self._sensing.measure(self._sensing.decode(frame[frames.HEADER.size : -2]))
+        measured = self._sensing.measure(self._sensing.decode(tick["answer"]))
         # The hand's measurements are recomputed; camera, goal and command are taken from the log.
         again = {name: getattr(measured, name) for name in ("joint_position", "joint_torque", "taxel_force")}
         same = all(_same(value, tick["readings"][name]) for name, value in again.items())
@@ -170,8 +158,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     verdict = "all observations agree to the last bit" if ticks else "nothing could be compared"
     if first := report["first_difference"]:
         verdict = f"{report['observations_same']} of {ticks} observations agree; first difference: {first}"
-    if missing := report["without_frame"]:
-        verdict += f"; {missing} ticks lack their frame"
     print(*report["notes"], f"{ticks} ticks in {report['seconds']:.2f} s, {read}, end: {report['ended']}", sep="\n")
     print(verdict)
     if arguments.output:

@@ -32,7 +32,7 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.loop import LoopOptions, LoopThread
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire.serial_hand import open_port
+from dexsim_real.wire.driver import open_port
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -71,9 +71,9 @@ BUDGETS = {
     "dexsim/calibration dexsim/identification": 1_505,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_105,  # goal: 1,900
     "dexsim_ppo": 3_885,  # goal: 4,000
-    "dexsim_real": 8_715,  # goal: 6,500
-    "benchmarks": 2_095,
-    "tests": 20_755,  # goal: 18,000
+    "dexsim_real": 8_540,  # goal: 6,500
+    "benchmarks": 2_065,
+    "tests": 20_745,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -15,7 +15,7 @@ from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
 from dexsim_real.twin.virtual import VirtualRun
-from dexsim_real.wire.serial_hand import check_wire
+from dexsim_real.wire.driver import check_wire
 
 
 class Emulation:

@@ -39,7 +39,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     plan = placements(hand, arguments.fingers, arguments.sides)
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
     arguments = dataclasses.replace(arguments, safety=slow)
-    with stopping(), Bench(arguments, hand, operator, "calibrate", **bench) as work:
+    with stopping(), Bench(arguments, hand, operator, **bench) as work:
         procedure = PressProcedure(work)
         pressed = 0
         try:

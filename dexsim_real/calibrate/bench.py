@@ -19,16 +19,16 @@ from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import Config, from_dict, setting, to_dict
 from dexsim.hand.description import Hand
+from dexsim_real.control.controller import smooth
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import smooth
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter, Record, reading
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.loop import ExchangeLoop, LoopOptions
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.link import UNCONFIRMED, HandPort, Identity
-from dexsim_real.wire.serial_hand import open_port
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 _READING = re.compile(r"([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*(n|g|kg|)", re.IGNORECASE)
@@ -198,7 +198,6 @@ class Bench(ExchangeLoop):
     an exchange and returns its result. The taxels' zeros stay as they were tared: what they read is measured.
 
     Args:
-      task: "calibrate" or "identify", written to the log with the configuration.
       port: replaces the port that the arguments name.
       clock: `clock` and `sleep` of `ExchangeLoop`, for simulated time.
     """
@@ -208,12 +207,11 @@ class Bench(ExchangeLoop):
         arguments: CalibrateArguments,
         hand: Hand,
         operator: Operator,
-        task: str,
         *,
         port: HandPort | None = None,
         **clock: Any,
     ):
-        self.arguments, self.operator, self._task = arguments, operator, task
+        self.arguments, self.operator = arguments, operator
         port = port or open_port(str(arguments.port), hand, arguments.link)
         if not arguments.identify and (lacking := [name for name in port.missing if name != "temperatures"]):
             raise HandError(f"presses need taxels and currents, and the hand has no {lacking[0]}: --identify")
@@ -223,7 +221,6 @@ class Bench(ExchangeLoop):
         super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, **clock)
         self._newest: dict[str, Any] = {}  # the last exchange, as the log has it
         self._failing_since: float | None = None
-        self._connection: int | None = None
 
     def __enter__(self) -> "Bench":
         arguments, hand = self.arguments, self.sensing.hand
@@ -235,8 +232,9 @@ class Bench(ExchangeLoop):
             for line in self.port.greet(hand, calibration):
                 self._say(line)
             meta = {name: to_dict(getattr(arguments, name)) for name in ("hardware", "safety", "press")}
-            meta |= {"task": self._task, "rate": arguments.rate, "identity": tuple(self.port.identity)}
-            self.log.add(Kind.META, meta | {"clock": time.time(), "environment": cli.environment_report()})
+            meta |= {"task": "identify" if arguments.identify else "calibrate", "rate": arguments.rate}
+            meta |= {"identity": tuple(self.port.identity), "environment": cli.environment_report()}
+            self.log.add(Kind.META, meta | {"clock": time.time()})
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise
@@ -271,7 +269,7 @@ class Bench(ExchangeLoop):
             self.safety.set_target(target, now)
         sample = self.cycle()
         answer = b"" if sample is None else sample.state.tobytes()
-        self._newest = {"sent": now, "command": self.command.tobytes(), "answer": answer}
+        self._newest = {"sent": now, "command": self.command["position"].copy(), "answer": answer}
         self._check(now, sample)
         self.pace.wait()
         return None if self.safety.problem else sample
@@ -324,10 +322,8 @@ class Bench(ExchangeLoop):
             raise HandError(f"stopped: {safety.latched}")
         if self.log.failure:
             raise HandError(f"stopped: the log is lost ({self.log.failure})")
-        if sample is not None:
-            if self._connection not in (None, sample.generation):
-                raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
-            self._connection = sample.generation
+        if sample is not None and sample.generation > 1:
+            raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
         reaction, reason = safety.last
         working = sample is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now

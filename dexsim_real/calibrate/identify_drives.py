@@ -25,10 +25,8 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError
 from dexsim_real.core.process import stopping
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire import frames
 from dexsim_real.wire.link import check_identity
 
-TASK = "identify"
 Marks = list[dict[str, Any]]
 """Annotated exchanges of one joint and signal, in the order of time."""
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
@@ -97,7 +95,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep clear of them")
-    with stopping(), Bench(arguments, hand, operator, TASK, **bench) as work:
+    with stopping(), Bench(arguments, hand, operator, **bench) as work:
         try:
             work.set_zero(work.collect(_TARE))  # Otherwise `Safety` would mistake the taxels' zero error for a touch.
             if operator.ask("  Enter starts, s stops:", work.step) is None:
@@ -124,7 +122,7 @@ def read_joints(
       LogError: not a log of an identification, or of another hand or configuration than the logs before.
       HandError: the calibration is of another hand.
     """
-    source, logs = read_logs(paths, TASK)
+    source, logs = read_logs(paths, "identify")
     if calibration is not None:
         check_identity(source.identity, hand, calibration)
     recorded: dict[str, dict[str, Marks]] = {}
@@ -152,7 +150,7 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
         found = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
         raise LogError(f"exchanges took {found}: set the adapter's latency timer to 1 ms, or lower --rate")
     sensing, rows = HandSensing(hand, source.hardware, calibration), np.arange(len(marks))
-    commands = np.array([frames.decode_command(mark["command"], hand.num_joints)["position"] for mark in marks])
+    commands = np.array([mark["command"] for mark in marks])
     answers = [sensing.measure(sensing.decode(mark["answer"])) for mark in marks if mark["measured"]]
     position, share = np.array([(answer.joint_position[joint], answer.joint_torque[joint]) for answer in answers]).T
     # Few samples are missing: interpolate them.

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.line import fit_line
@@ -28,8 +29,7 @@ from dexsim.hand.description import Hand
 from dexsim_real.calibrate.bench import Source, read_logs
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING
 from dexsim_real.core.log import Kind, Record
-from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.taxels import around, taxel_names
+from dexsim_real.sensors.hand import HandSensing, around, taxel_names
 
 Scale = tuple[float, float, float]
 """Of a press's taxel counts: N per count, N without counts, and the share (95 %) by which the first may be wrong."""
@@ -256,11 +256,9 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
 
 def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
-    size, count = np.abs(current), run.max() + 1
-    highest = np.zeros(count)
-    np.maximum.at(highest, run, size)
-    top = size > _TOP * highest[run]
-    return top & (np.bincount(run, top, count) >= _TOP_BLOCKS)[run]
+    size = np.abs(current)
+    top = size > _TOP * ndimage.maximum(size, run, run)
+    return top & (ndimage.sum_labels(top, run, run) >= _TOP_BLOCKS)
 
 
 def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str, JointFit]) -> np.ndarray:
@@ -337,8 +335,7 @@ def repaired(hand: Hand, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     did: they get the mean of their working neighbours. What reads next to nothing far from the press becomes 0."""
     largest = counts.max(0, keepdims=True)
     pressed, beside = largest >= _ACTIVE, around(hand, largest >= _ACTIVE)
-    dead = (largest <= 0) & (beside.sum(0) >= around(hand, np.ones(largest.shape)).sum(0) / 2)
+    dead = (largest <= 0) & (beside >= around(hand, np.ones(largest.shape)) / 2)
     working = np.where(dead, 0.0, 1.0)
-    total, near = around(hand, counts * working).sum(0), around(hand, working).sum(0)
-    filled = np.where(dead, total / np.maximum(near, 1), counts)
-    return np.where(pressed | beside.any(0), filled, 0.0), dead[0]
+    filled = np.where(dead, around(hand, counts * working) / np.maximum(around(hand, working), 1), counts)
+    return np.where(pressed | (beside > 0), filled, 0.0), dead[0]

@@ -27,9 +27,9 @@ from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.frames import passive_command
 from dexsim_real.wire.link import UNCONFIRMED, LinkConfig
-from dexsim_real.wire.serial_hand import open_port
 
 _OFF = b"off"
 _STARTUP = 20.0  # s, longest start of the guard

@@ -99,25 +99,21 @@ class HeightSensor:
             raise HandError(f"the policy observes the object's coordinates {axes}, and a camera measures one")
         self._masks, self._config, self._weight = masks, config, weight
         self._reference, self._axis = np.asarray(reference, float), axes.index(True)
-        self._newest: tuple[float, np.ndarray, np.ndarray] | None = None
+        self.newest: tuple[float, np.ndarray, np.ndarray] | None = None
+        """What `read` gives; None before the object was seen."""
         self.failure = ""  # why no picture comes any more
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vision", daemon=True)
         self._thread.start()
 
-    @property
-    def has_measurement(self) -> bool:
-        """Whether the object has been seen."""
-        return self._newest is not None
-
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Time of the newest measurement (s, monotonic clock), position [3] m and filtered velocity [3] m/s."""
-        assert self._newest is not None, "wait until `has_measurement` is true"
-        return self._newest
+        assert self.newest is not None, "wait until the object was seen"
+        return self.newest
 
     def update(self, when: float, mask: np.ndarray) -> None:
         """Update with the mask of a picture taken at a time in s; one no newer than the newest says nothing new."""
-        if self._newest is not None and when <= self._newest[0]:
+        if self.newest is not None and when <= self.newest[0]:
             return
         height = height_of(mask, self._config, self._reference, self._axis)
         if height is None:
@@ -125,10 +121,10 @@ class HeightSensor:
         position = self._reference.copy()
         position[self._axis] = height
         velocity = np.zeros(3)
-        if self._newest is not None:
-            before, place, velocity = self._newest
+        if self.newest is not None:
+            before, place, velocity = self.newest
             velocity = velocity + self._weight * ((position - place) / (when - before) - velocity)
-        self._newest = when, position, velocity
+        self.newest = when, position, velocity
 
     def close(self) -> None:
         self._stop.set()
@@ -178,7 +174,7 @@ class ObjectSensors:
 
         Raises HandError: no picture will come any more.
         """
-        if self.camera and not self.camera.has_measurement:
+        if self.camera and self.camera.newest is None:
             if self.camera.failure:
                 raise HandError(self.camera.failure)
             return False

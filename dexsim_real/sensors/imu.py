@@ -44,8 +44,8 @@ def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float
     return HEAD + body + bytes([sum(body) & 0xFF])
 
 
-def decode(frame: bytes) -> np.ndarray | None:
-    """Orientation (w, x, y, z) of an RVC frame; None when the frame is damaged."""
+def decode(frame: bytes) -> tuple[int, np.ndarray] | None:
+    """Index and orientation (w, x, y, z) of an RVC frame; None when the frame is damaged."""
     body = frame[len(HEAD) : -1]
     if len(frame) != SIZE or frame[:2] != HEAD or sum(body) & 0xFF != frame[-1]:
         return None
@@ -54,12 +54,7 @@ def decode(frame: bytes) -> np.ndarray | None:
         return None
     quat = np.zeros(4)
     mujoco.mju_euler2Quat(quat, np.radians([yaw, pitch, roll]) / 100, "zyx")
-    return quat
-
-
-def make_parser() -> FrameParser[tuple[int, np.ndarray]]:
-    """Finds the frames in a stream of bytes: their index and orientation."""
-    return FrameParser(HEAD, SIZE, len, lambda frame: None if (quat := decode(frame)) is None else (frame[2], quat))
+    return frame[2], quat
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -87,7 +82,7 @@ class ImuReader:
     """
 
     def __init__(self, mount: tuple[float, ...] = UPRIGHT_X):
-        self.parser = make_parser()
+        self.parser = FrameParser(HEAD, SIZE, len, decode)
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None

@@ -28,9 +28,8 @@ from dexsim_real.core.process import use_realtime
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
-from dexsim_real.twin.wire.firmware import SERIALS, Firmware, HandLine, Terminal
-from dexsim_real.wire.serial_hand import check_wire
+from dexsim_real.twin.wire import SERIALS, EmulatedCamera, EmulatedImu, Firmware, HandLine, Terminal
+from dexsim_real.wire.driver import check_wire
 
 _BUSY = 0.002  # s, longest that a slice of the physics or a picture takes
 SLICE = 0.001  # s, simulated at once

@@ -1,14 +1,13 @@
 """A run on the emulated hand in virtual time: the bridge's loops in one process, as fast as they compute.
 
-Exchange loop (`dexsim_real.loop`) and policy loop (`dexsim_real.control.policy_loop`) are those of a run on a hand.
+Exchange loop (`dexsim_real.loop`) and policy loop (`dexsim_real.control.controller`) are those of a run on a hand.
 Whoever waits lets the time pass: meanwhile the plant advances, and policy, IMU and camera have their events. Every
 exchange is executed by the emulated palm board in the blocks of the wire, so quantisation and delays are those of the
 wire.
 """
 
 import dataclasses
-import heapq
-import itertools
+import sched
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,9 +16,8 @@ import numpy as np
 from dexsim.calibration.maps import Calibration, Side, blank_calibration
 from dexsim.hand.description import Hand
 from dexsim.task_spec import TaskSpec
-from dexsim_real.control.controller import Controller, Tick
+from dexsim_real.control.controller import Controller, PolicyLoop, Tick, limits_for
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import ExchangeLoop
@@ -28,9 +26,8 @@ from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import BAUD, ImuReader
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.wire.emulated_sensors import CAMERA_RATE, IMU_RATE, ImuFrames, picture
-from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, Firmware
-from dexsim_real.wire.frames import HOST, Command, Frame, decode_state, palm_address
+from dexsim_real.twin.wire import CAMERA_RATE, FORCE_PER_COUNT, IMU_RATE, Firmware, ImuFrames, picture
+from dexsim_real.wire.frames import HOST, Command, Frame, decode, palm_address
 from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, LinkCounts, Reply
 
 RATE = 83.0  # exchanges a second
@@ -63,8 +60,7 @@ class VirtualPort(HandPort):
     def __init__(self, plant: EmulatedHand):
         self.plant, self.firmware = plant, Firmware(plant)
         self.time, self.counts = 0.0, LinkCounts()
-        self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = itertools.count()
+        self.events = sched.scheduler(self.clock)
 
     def connect(self) -> str:
         """There is nothing to open."""
@@ -83,7 +79,7 @@ class VirtualPort(HandPort):
         self.wait_until(sent + ROUND_TRIP)
         self.counts.sent += 1
         self.counts.answered += 1
-        return Reply(decode_state(answer.data), sent, self.time, self.counts.sent, generation=1)
+        return Reply(decode(answer.data), sent, self.time, self.counts.sent, generation=1)
 
     def clock(self) -> float:
         """Virtual time in s."""
@@ -93,25 +89,20 @@ class VirtualPort(HandPort):
         """Let a duration in s pass."""
         self.wait_until(self.time + seconds)
 
-    def at(self, time: float, call: Callable[[], None]) -> None:
-        """Schedule a call at a time in s."""
-        heapq.heappush(self._events, (time, next(self._order), call))
-
     def every(self, period: float, first: float, call: Callable[[], None]) -> None:
         """Schedule a call every `period` s from a time in s on."""
 
         def repeat() -> None:
             call()
-            self.at(self.time + period, repeat)
+            self.events.enterabs(self.time + period, 0, repeat)
 
-        self.at(first, repeat)
+        self.events.enterabs(first, 0, repeat)
 
     def wait_until(self, time: float) -> None:
         """Let the time pass until a time in s, with all events up to it."""
-        while self._events and self._events[0][0] <= time:
-            when, _, call = heapq.heappop(self._events)
-            self._pass(when)
-            call()
+        while (due := self.events.queue) and due[0].time <= time:
+            self._pass(due[0].time)
+            self.events.run(blocking=False)
         self._pass(time)
 
     def _pass(self, time: float) -> None:
@@ -127,7 +118,7 @@ def virtual_imu(port: VirtualPort, seed: int) -> ImuReader:
     def sample() -> None:
         data = frames.sample()
         arrival = port.time + BITS_PER_BYTE * len(data) / BAUD
-        port.at(arrival, lambda: reader.receive(arrival, data))
+        port.events.enterabs(arrival, 0, reader.receive, (arrival, data))
 
     port.every(1 / IMU_RATE, 0.001, sample)
     return reader
@@ -171,12 +162,6 @@ class VirtualRun:
             controller, self.safety, objects, command=self.command, approach_seconds=_APPROACH, place_seconds=_PLACE
         )
 
-    def run(self) -> dict[str, Any]:
-        """Run the trial; returns its `report`."""
-        for _ in self.ticking():
-            pass
-        return self.report()
-
     def report(self) -> dict[str, Any]:
         """The referee's report of a trial that has ended, with the measurements of the bridge as `bridge`."""
         policy = self.policy
@@ -191,7 +176,7 @@ class VirtualRun:
         return report | {"command": policy.command, "bridge": measured}
 
     def ticking(self) -> Iterator[tuple[float, Tick]]:
-        """Run the trial in pieces: yields time in s and tick, after the policy's ticks, and ends with the trial."""
+        """Run the trial: yields time in s and tick, after the policy's ticks, and ends with the trial (`report`)."""
         policy, port, period, ticks = self.policy, self.port, self.controller.period, list[tuple[float, Tick]]()
         self.loop.tare()
         self.loop.engage()

@@ -6,14 +6,16 @@ statistics, and the blocks of `dexsim_real.wire.frames`, so that loop, safety, l
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 
 from dexsim.hand.description import Hand
-from dexsim_real.core.errors import HandError
+from dexsim_real.core.errors import HandError, find_function
+from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HOST, Command, Frame, Mode, driver_block, palm_address, passive_command
-from dexsim_real.wire.link import HandPort, LinkConfig, Refusal, Reply
+from dexsim_real.wire.link import HandPort, LinkConfig, Refusal, Reply, SerialHand
 
 NEWTONS_PER_COUNT = 0.1  # of the blocks' taxel counts; the default of `--hardware.force-per-count`
 WITHOUT = {
@@ -100,21 +102,15 @@ class DriverPort(HandPort):
         """One line for each thing that this hand does not measure."""
         return [WITHOUT[name] for name in self.missing]
 
-    def connect(self) -> str:
-        try:
-            line = self.driver.connect()
-        except OSError as error:
-            raise HandError(f"the hand cannot be reached ({error}); check cable and power") from None
-        self._connected = True
-        self._generation += 1
-        return line
-
     def close(self) -> None:
         self._connected = False
         self.driver.close()
 
-    def _reopen(self) -> None:
-        self.connect()
+    def _connect(self, again: bool = False) -> str:
+        line = self.driver.connect()
+        self._connected = True
+        self._generation += 1
+        return line
 
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1
@@ -174,3 +170,24 @@ def _checked(
     if not np.isfinite(array).all():
         raise HandError(f"the driver's {name} is not finite; `read` returns None where it has no whole state")
     return array
+
+
+def check_wire(hand: Hand) -> None:
+    """Raises HandError: the hand has other joints or taxels than the frames carry."""
+    if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (frames.JOINTS, frames.TIPS, frames.TAXELS):
+        has = f"{hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels"
+        raise HandError(f"{hand.name}: {has}, unlike the XHand: give a driver, --port sdk:MODULE (docs/bridge.md)")
+
+
+def open_port(spec: str, hand: Hand, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
+    """The hand at a port: an XHand's serial port, or `sdk:MODULE:FUNCTION` for a function that takes the `Hand` and a
+    `LinkConfig` and returns a `HandDriver`. `tap` is that of `SerialHand`.
+
+    Raises HandError: the module or function cannot be found, or the serial port is for another hand.
+    """
+    if not spec.startswith("sdk:"):
+        check_wire(hand)
+        return SerialHand(spec, config, tap=tap)
+    form = "sdk:MODULE:FUNCTION of an importable module"
+    driver = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(hand, config)
+    return DriverPort(driver, hand, config, tap=tap)

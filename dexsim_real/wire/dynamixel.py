@@ -1,20 +1,11 @@
 """A driver for hands of Dynamixel motors, such as the LEAP Hand's sixteen XL330 or XC330: protocol 2.0 on pyserial.
 
-A file of your own tells port and motors, in the order of the joints in the hand's TOML; for `leap_like`:
-
-    # my_leap.py, for --port sdk:my_leap
-    from dexsim_real.wire.dynamixel import DynamixelHand
-
-    def open_hand(hand, link):
-        ids = [12, 13, 14, 15, 1, 0, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11]
-        return DynamixelHand("/dev/serial/by-id/...", ids, baud=4_000_000)
-
-Motors run in the current-based position mode: `--hardware.torque-max` is their goal current in mA, `--hardware.kp`,
-`ki` and `kd` are the registers of the position gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in
-the maker's tools. Packets, checksum and registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
+A file of your own tells port and motors (docs/bridge.md). They run in the current-based position mode:
+`--hardware.torque-max` is their goal current in mA, `--hardware.kp`, `ki` and `kd` are the registers of the position
+gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in the maker's tools. Packets, checksum and
+registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
 """
 
-import functools
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -71,16 +62,10 @@ def crc16(data: bytes | bytearray) -> int:
     """CRC-16 of the protocol: polynomial 0x8005, start 0, not reflected; 0xFEE8 for b"123456789"."""
     value = 0
     for byte in data:
-        value = (value << 8 & 0xFFFF) ^ _crc_row(value >> 8 ^ byte)
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (0x18005 if value & 0x8000 else 0)
     return value
-
-
-@functools.cache
-def _crc_row(byte: int) -> int:
-    value = byte << 8
-    for _ in range(8):
-        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
-    return value & 0xFFFF
 
 
 def packet(motor: int, instruction: int, data: bytes) -> bytes:

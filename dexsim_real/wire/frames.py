@@ -193,17 +193,11 @@ def passive_command(joints: int = JOINTS) -> np.ndarray:
     return command_block(np.zeros(joints), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
 
 
-def decode_command(data: bytes, joints: int = JOINTS) -> np.ndarray:
-    """Joint commands [J] from the data of a host's `EXCHANGE`. FrameError: wrong size, or ids that do not count up."""
-    return _decode(data, np.dtype((JOINT_COMMAND, (joints,))))
+def decode(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
+    """The block in the data of an `EXCHANGE`: the hand's state, or joint commands (`COMMAND_BLOCK`).
 
-
-def decode_state(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
-    """The state from the data of a hand's `EXCHANGE`. FrameError: wrong size, or joint ids that do not count up."""
-    return _decode(data, dtype)
-
-
-def _decode(data: bytes, dtype: np.dtype) -> np.ndarray:
+    Raises FrameError: wrong size, or joint ids that do not count up.
+    """
     if len(data) != dtype.itemsize:
         raise FrameError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
     block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()

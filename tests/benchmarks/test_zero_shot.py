@@ -32,7 +32,6 @@ def zero_shot(monkeypatch):
         ("--set nope=1", "the emulated hand has no parameter 'nope'"),
         ("--limit speed=1e9", "must be between 0.01 and 200 rad/s"),
         ("--policy rotate", "of the task 'rotate', not 'grasp'"),
-        ("--trials 0", "--trials: 0: must be at least 1"),
     ],
 )
 def test_options_are_checked_before_the_first_trial(zero_shot, capsys, words, message):

@@ -25,6 +25,6 @@ def controller_of():
 @pytest.fixture
 def jax_as_it_is(monkeypatch, controller_of):
     """Runs within the tests' process leave the flags that other tests compile with alone."""
-    monkeypatch.setattr("dexsim_real.run.session.Controller", controller_of)
-    monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.run.Controller", controller_of)
+    monkeypatch.setattr("dexsim_real.run.prepare_jax", lambda: None)
     monkeypatch.setattr("dexsim_real.replay.prepare_jax", lambda: None)

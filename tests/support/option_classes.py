@@ -5,7 +5,7 @@ OPTIONS = {
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
     "dexsim_ppo.export": ("dexsim_ppo.export:ExportArguments", ["grasp", "--output", "grasp.onnx"]),
     "dexsim_ppo.record": ("dexsim_ppo.record:RecordArguments", ["grasp", "--rrd", "x.rrd"]),
-    "dexsim_real.run": ("dexsim_real.run.session:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
+    "dexsim_real.run": ("dexsim_real.run:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.bench:CalibrateArguments", ["--port", "x"]),
     "dexsim_real.twin": ("dexsim_real.twin.__main__:TwinArguments", []),
     "dexsim_real.replay": ("dexsim_real.replay:ReplayArguments", ["x.log"]),

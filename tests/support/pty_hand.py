@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim_real.twin.wire.firmware import Terminal
+from dexsim_real.twin.wire import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HOST_REQUESTS, Command, Frame, Parser
 from dexsim_real.wire.link import LinkConfig
@@ -78,7 +78,7 @@ class PtyHand:
             return whole and Frame(0x80, 0xFE, Command.READ_REGISTER, whole).encode()
         if frame.command != Command.EXCHANGE:
             return b""
-        command = frames.decode_command(frame.data)
+        command = frames.decode(frame.data, frames.COMMAND_BLOCK)
         self.commands.append(command)
         custom = self.answer(len(self.commands) - 1, command, self.state) if self.answer else None
         return self.whole() if custom is None else custom

@@ -5,7 +5,7 @@ import threading
 from twin_plant import REST, ScriptedPlant
 
 from dexsim_real.twin.__main__ import Twin, TwinArguments
-from dexsim_real.twin.wire.firmware import Firmware, HandLine
+from dexsim_real.twin.wire import Firmware, HandLine
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 

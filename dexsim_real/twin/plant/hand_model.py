@@ -167,12 +167,12 @@ def _find_tip(model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int)
 
 def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Pose, tips: list[int]) -> None:
     """Check where the fingertips are with all joints at 0, and with each at its upper end."""
-    data, reference = mujoco.MjData(model), mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
+    data = mujoco.MjData(model)
     for j in range(-1, hand.num_joints):
         posture = np.where(np.arange(hand.num_joints) == j, hand.joint_upper, 0.0)
         data.qpos[model.jnt_qposadr[joints]] = posture
         mujoco.mj_kinematics(model, data)
-        expected, _ = _hand_tips(hand, reference, posture)
+        expected, _ = _hand_tips(hand, posture)
         apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - expected, axis=-1)
         if not apart.max() <= _APART:
             where = f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad" if j >= 0 else "all joints at 0"
@@ -181,8 +181,9 @@ def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Po
             raise ValueError(f"with {where} {tip} from where the hand has it: {todo}")
 
 
-def _hand_tips(hand: Hand, data: mujoco.MjData, posture: np.ndarray) -> Pose:
-    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by `data` of the hand's MJCF."""
+def _hand_tips(hand: Hand, posture: np.ndarray) -> Pose:
+    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's MJCF."""
+    data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
     for name, angle in zip(hand.joint_names, posture, strict=True):
         data.joint(name).qpos[0] = angle
     mujoco.mj_kinematics(data.model, data)
@@ -194,8 +195,7 @@ def _hand_tips(hand: Hand, data: mujoco.MjData, posture: np.ndarray) -> Pose:
 
 def _add_lattices(spec: mujoco.MjSpec, data: mujoco.MjData, hand: Hand, palm: Pose, tips: list[int]) -> list[str]:
     """Add the frames of the taxels: at the tip sites, turned as on the hand with all joints at 0 (as in `data`)."""
-    reference = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
-    turns = palm[1] @ _hand_tips(hand, reference, np.zeros(hand.num_joints))[1]
+    turns = palm[1] @ _hand_tips(hand, np.zeros(hand.num_joints))[1]
     names = [f"lattice_{finger}" for finger in hand.finger_names]
     for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
         body, quat = int(data.model.site_bodyid[site]), np.empty(4)

@@ -22,13 +22,6 @@ END_STOP = 300.0  # Nm/rad
 _GREASE = 0.02  # Nm s/rad, assumed viscous friction of a gear
 _STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: a sticking joint creeps by less than 1e-3 rad/s
 _FAR = 0.2  # m above the palm, where rays start
-KINDS = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "disc": mujoco.mjtGeom.mjGEOM_CYLINDER,
-}
 
 
 class Scene:
@@ -98,8 +91,8 @@ def add_object(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
     body.add_freejoint(name="object")
     for k, part in enumerate(shape.parts):
         size = [*part.size, 0.0, 0.0][:3]
-        geom = body.add_geom(name=f"object_{k}", type=KINDS[part.kind], size=size, pos=part.place, density=1.0)
-        geom.contype = geom.conaffinity = 0
+        geom = body.add_geom(name=f"object_{k}", size=size, pos=part.place, density=1.0, contype=0, conaffinity=0)
+        geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.replace('disc', 'cylinder').upper()}")
         if part.kind == "disc":
             geom.quat = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # z to x
 

@@ -151,11 +151,11 @@ def test_the_emulated_hand_is_a_source(hand, monkeypatch):
 
 def test_a_log_is_a_source(tmp_path, monkeypatch):
     pytest.importorskip("serial")
-    monkeypatch.setattr("dexsim_real.run.session.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.run.prepare_jax", lambda: None)
     from following_hand import FollowingHand, arguments, records
 
+    from dexsim_real import run as runner
     from dexsim_real.core.log import Kind
-    from dexsim_real.run import __main__ as runner
 
     with FollowingHand() as peer:
         assert runner.main(arguments(peer, tmp_path, "--seconds", "0.6")) == 0

@@ -59,8 +59,8 @@ def test_the_left_hand_is_calibrated_by_the_same_presses(hand):
         np.testing.assert_allclose(other.direction, one.direction, atol=1e-5)
 
 
-def bench_of(port, hand, options, task="calibrate"):
-    return Bench(options, hand, operator(), task, port=port, clock=port.clock, sleep=port.sleep)
+def bench_of(port, hand, options):
+    return Bench(options, hand, operator(), port=port, clock=port.clock, sleep=port.sleep)
 
 
 def quick(folder, **options):
@@ -302,7 +302,7 @@ def test_a_touched_or_another_hand_is_refused_before_the_motors_come_on(hand, pr
     port.identity = Identity("2R32A", "right")
     options = arguments(tmp_path, calibration=tmp_path / "known.toml", identify=True, log=tmp_path / "b.log")
     with pytest.raises(HandError, match="this is hand 2R32A, the calibration is of hand 2R32B"):
-        bench_of(port, hand, options, "identify").__enter__()
+        bench_of(port, hand, options).__enter__()
     assert all(not on(bench).any() and bench.closed for bench in (pressed, port) if bench.commands)
     assert port.closed and not (tmp_path / "hand.toml").exists()
 

@@ -30,11 +30,9 @@ from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.start import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate, goal_quat
-from dexsim_real.control import policy_loop
-from dexsim_real.control.controller import Controller, Tick
-from dexsim_real.control.policy_loop import TurnGoals
+from dexsim_real.control.controller import Controller, PolicyLoop, Tick, TurnGoals
 from dexsim_real.control.safety import Reaction
-from dexsim_real.sensors.camera import ObjectEstimate
+from dexsim_real.sensors.camera import ObjectEstimate, ObjectSensors
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import IDENTITY, ImuReader, encode
 from dexsim_real.wire import frames
@@ -125,7 +123,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         seen = ObjectEstimate(rng.normal(size=3), rng.normal(size=3), quats[0])
         data = random_state(rng, hand).tobytes()
-        tick = controller.tick(sensing.measure(frames.decode_state(data)), seen, quats[1], 0.37)
+        tick = controller.tick(sensing.measure(frames.decode(data)), seen, quats[1], 0.37)
         simulated = np.asarray(door(tick.readings, goal))
         assert simulated.dtype == tick.observation.dtype == np.float32
         assert simulated.tobytes() == tick.observation.tobytes()
@@ -244,8 +242,8 @@ class Still:
 @pytest.mark.parametrize("silent", [False, True])
 def test_a_silent_imu_is_held_within_a_third_of_a_second_then_relaxed(hand, silent):
     bench, imu = Bench(hand), ImuReader()
-    objects = policy_loop.ObjectSensors(np.zeros(3), (0.0, 0.0, -9.81), None, imu)
-    loop = policy_loop.PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach_seconds=0, place_seconds=0)
+    objects = ObjectSensors(np.zeros(3), (0.0, 0.0, -9.81), None, imu)
+    loop = PolicyLoop(Still(hand), bench.safety, objects, command=0.5, approach_seconds=0, place_seconds=0)
     imu.receive(bench.now, encode(0, IDENTITY))
     bench.engage()
     bench.cycle()

@@ -25,16 +25,14 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.hand.source import recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real import replay
-from dexsim_real.control.controller import Controller
+from dexsim_real import replay, run
+from dexsim_real.control.controller import Controller, limits_for
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.policy_loop import limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.loop import TARE_SAMPLES
-from dexsim_real.run import __main__ as run, session, status
-from dexsim_real.run.session import Outcome
+from dexsim_real.run import Outcome
 from dexsim_real.sensors.camera import encode_mask
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.virtual import ideal_calibration
@@ -233,7 +231,7 @@ def test_a_run_ends_when_its_exchange_thread_has_failed():
 
     parts = SimpleNamespace(loop=SimpleNamespace(check=fail), safety=SimpleNamespace(latched=""))
     with pytest.raises(HandError, match="the exchange thread failed"):
-        session.Session._check(parts)
+        run.Session._check(parts)
 
 
 def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
@@ -346,8 +344,8 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
     tip["taxel"]["z"][:, :3] = np.arange(200, 205)[:, None]
     tip["temperature"] = np.arange(121, 126)
     measured, targets = HandSensing(hand, HardwareConfig()).measure(block), np.linspace(-2, 1.8, 12)
-    tables = status.hand_tables(hand, measured, targets, True)
-    view = status.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables)
+    tables = run.hand_tables(hand, measured, targets, True)
+    view = run.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables)
     view.console = Console(width=100, file=io.StringIO())
     view.show()
     shown = view.console.file.getvalue()
@@ -361,7 +359,7 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
         assert re.search(rf"{name} +{60 + 0.3 * finger:.1f} +{121 + finger}$", shown, re.MULTILINE)
     assert re.search(r"sum +303.0 *$", shown, re.MULTILINE) and re.search(r"palm board +42$", shown, re.MULTILINE)
     assert "not sent" not in shown
-    tables = status.hand_tables(hand, measured, None, False)
+    tables = run.hand_tables(hand, measured, None, False)
     view.show()
     assert "(not sent)" in view.console.file.getvalue()
 
@@ -381,11 +379,11 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, capsys):
 def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
     """An SSH connection that broke, a `tee` that Ctrl-C ended: with Rich alone the exchange thread would end."""
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(status, "_LIVE", 0.02)
+    monkeypatch.setattr(run, "_LIVE", 0.02)
     far, near = os.openpty() if gone == "window" else os.pipe()
     screen = os.fdopen(near, "w", buffering=1)
     monkeypatch.setattr("sys.stderr", screen)
-    view = status.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "")
+    view = run.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "")
     os.close(far)
     try:
         view.note("before")
@@ -442,6 +440,6 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
             error = SimpleNamespace(write=lambda text: os.write(master, b"n\n"), flush=lambda: None)
             monkeypatch.setattr("sys.stderr", error)
             with pytest.raises(HandError, match="the motors stayed off"):
-                session.ask()
+                run.ask()
     finally:
         os.close(master)

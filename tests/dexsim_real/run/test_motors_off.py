@@ -200,7 +200,7 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(p
         "import sys\n"
         "from dexsim_real.wire.driver import DriverState\n"
         "from dexsim_real.wire.frames import Mode, passive_command\n"
-        "from dexsim_real.wire.serial_hand import SerialHand\n"
+        "from dexsim_real.wire.link import SerialHand\n"
         "print('SDK 1.0', flush=True)\n"
         "opened = []\n"
         "class Loud:\n"

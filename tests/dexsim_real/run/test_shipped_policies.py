@@ -17,7 +17,9 @@ def trial(hand, controller_of):
         controller.warm()
         task = controller.policy.task
         plant = EmulatedHand(hand, task, 1, kind="nominal", seconds=seconds, trials=1, shape_name="sphere")
-        report = VirtualRun(plant, controller, command).run()
+        run = VirtualRun(plant, controller, command)
+        list(run.ticking())
+        report = run.report()
         assert report["bridge"]["latched"] == "", report
         return report
 

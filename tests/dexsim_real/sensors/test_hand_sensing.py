@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from dexsim.observation import GRASP, ROTATE, ROTATE_CRITIC
 from dexsim_real.control.controller import sources_of
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig, filtered_velocity
 from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 from dexsim_real.twin.virtual import ideal_calibration
@@ -93,18 +93,18 @@ def test_temperatures_and_error_bits_are_of_the_right_boards(hand):
     for joint in range(12):
         for board in range(3):
             data[24 * joint + 12 + 2 * board] = 16 * board + joint + 1
-    measured = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data)))
+    measured = HandSensing(hand, HardwareConfig()).measure(frames.decode(bytes(data)))
     np.testing.assert_array_equal(measured.temperature, [56] * 12 + [33] * 5 + [41])
     np.testing.assert_array_equal(measured.errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
 
 
 def test_velocity_from_differences():
     # A first-order filter: after n steps of h at a constant rate, 1 - (T / (T + h))^n of it is seen.
-    follow = VelocityFilter(12)
-    for n in range(6):
-        velocity = follow.update(0.01 * n, np.full(12, 0.03 * n, np.float32))
+    velocity = np.zeros(12, np.float32)
+    for _ in range(5):
+        velocity = filtered_velocity(velocity, np.full(12, 0.03, np.float32), 0.01)
     np.testing.assert_allclose(velocity, 3.0 * (1 - (2 / 3) ** 5), rtol=1e-4)
-    np.testing.assert_array_equal(follow.update(0.05, np.zeros(12, np.float32)), velocity)  # No time has passed.
+    np.testing.assert_array_equal(filtered_velocity(velocity, np.ones(12), 0.0), velocity)  # No time has passed.
 
 
 def test_who_measures_what():

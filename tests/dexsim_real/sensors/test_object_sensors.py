@@ -78,7 +78,7 @@ def test_a_camera_that_ends_or_fails_says_so():
 def test_a_picture_of_another_clock_does_not_stay_young(when):
     pictures = iter([(when, picture(REFERENCE, CameraConfig())), None])
     sensor = tracking(lambda: next(pictures))
-    assert until(lambda: sensor.has_measurement) and sensor.read()[0] <= time.monotonic()
+    assert until(lambda: sensor.newest) and sensor.read()[0] <= time.monotonic()
     sensor.close()
 
 
@@ -98,7 +98,7 @@ def apart(a, b):
 
 def test_the_datasheets_example_message():
     # Yaw 0.01, pitch -1.10, roll 20.85 degrees.
-    assert apart(imu.decode(DATASHEET), quat_of(0.01, -1.10, 20.85)) < 1e-3
+    assert apart(imu.decode(DATASHEET)[1], quat_of(0.01, -1.10, 20.85)) < 1e-3
     bad = bytearray(DATASHEET)
     bad[7] ^= 1
     assert imu.decode(bytes(bad)) is None and imu.decode(DATASHEET[:-1]) is None
@@ -107,7 +107,7 @@ def test_the_datasheets_example_message():
 @given(st.floats(-180, 180), st.floats(-89, 89), st.floats(-180, 180), st.integers(0, 300))
 def test_orientations_survive_the_wire(yaw, pitch, roll, index):
     quat = quat_of(yaw, pitch, roll)
-    assert apart(imu.decode(imu.encode(index, quat)), quat) < 2e-3
+    assert apart(imu.decode(imu.encode(index, quat))[1], quat) < 2e-3
 
 
 def turns(most):
@@ -221,13 +221,13 @@ def test_the_imu_thread_reads_a_port():
 
 
 def test_a_policy_waits_for_the_first_picture_and_not_for_a_camera_that_has_ended():
-    camera = SimpleNamespace(has_measurement=False, failure="")
+    camera = SimpleNamespace(newest=None, failure="")
     objects = ObjectSensors(np.zeros(3), DOWN, camera)
     assert not objects.ready()
     camera.failure = "the camera sends no more pictures"
     with pytest.raises(HandError, match="no more pictures"):
         objects.ready()
-    camera.has_measurement = True
+    camera.newest = (0.0,)
     assert objects.ready() and ObjectSensors(np.zeros(3), DOWN).ready()
 
 

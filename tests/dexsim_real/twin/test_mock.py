@@ -9,11 +9,10 @@ from driver_bench import DriverBench
 from untrained import untrained
 
 from dexsim import load_hand
-from dexsim_real import replay
+from dexsim_real import replay, run
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.run import __main__ as run
 from dexsim_real.twin.mock import MockHand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.wire.driver import WITHOUT

@@ -18,7 +18,7 @@ from dexsim.calibration.maps import load_calibration
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
 from dexsim_real.twin.__main__ import SLICE, Twin, TwinArguments
-from dexsim_real.twin.wire.firmware import FORCE_PER_COUNT, SERIALS
+from dexsim_real.twin.wire import FORCE_PER_COUNT, SERIALS
 
 
 def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(tmp_path):

@@ -52,7 +52,8 @@ def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
     run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
     update, heard = run.safety.update, []
     run.safety.update = lambda sample: heard.append(sample.time) or update(sample)
-    report = run.run()
+    list(run.ticking())
+    report = run.report()
     assert report["end"] == "time limit" and report["seconds"] == pytest.approx(0.5) and report["command"] == 0.25
     assert report["bridge"]["successes"] == run.policy.goals.successes == 0
     assert any(name.startswith("target beyond a limit") for name in run.safety.counts)

@@ -30,7 +30,7 @@ def test_a_version_request_and_a_command_block_byte_for_byte():
     for joint, angle in enumerate(np.linspace(-1, 1, 12)):
         row = struct.unpack_from("<HhhhfhH4H", data, 24 * joint)
         assert row == (joint, 100, -5, 12000, np.float32(angle), 300, 0 if joint == 3 else 3, 0, 0, 0, 0)
-    np.testing.assert_array_equal(frames.decode_command(data), block)
+    np.testing.assert_array_equal(frames.decode(data, frames.COMMAND_BLOCK), block)
 
 
 def test_a_state_block_byte_for_byte():
@@ -42,7 +42,7 @@ def test_a_state_block_byte_for_byte():
         taxels = b"".join(struct.pack("<bbB", -t, t, 2 * t) for t in range(120))
         data += struct.pack("<bbB", -i, i, 200 + i) + taxels + bytes(range(20)) + bytes([30 + i])
     assert len(data) == 12 * 24 + 5 * 384 == 2208
-    state, joints, taxels = frames.decode_state(data), np.arange(12), np.arange(120)
+    state, joints, taxels = frames.decode(data), np.arange(12), np.arange(120)
     joint, tip = state["joint"], state["tip"]
     for found, expected in (
         (joint["position"], (0.1 * joints).astype(np.float32)),
@@ -63,13 +63,13 @@ def test_a_state_block_byte_for_byte():
 
 def test_blocks_that_cannot_be_right_are_refused():
     with pytest.raises(FrameError, match="2207 bytes"):
-        frames.decode_state(bytes(2207))
+        frames.decode(bytes(2207))
     state = frames.empty_state()
     state["joint"]["id"][4] = 9
     with pytest.raises(FrameError, match="joint ids"):
-        frames.decode_state(state.tobytes())
+        frames.decode(state.tobytes())
     with pytest.raises(FrameError, match="joint ids"):
-        frames.decode_command(bytes(288))
+        frames.decode(bytes(288), frames.COMMAND_BLOCK)
 
 
 def test_a_host_does_not_take_its_own_echo_for_an_answer():

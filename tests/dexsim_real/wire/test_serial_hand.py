@@ -21,9 +21,9 @@ from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire import frames
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.frames import Command, Frame, Mode, empty_state
-from dexsim_real.wire.link import Identity, LinkCounts, check_identity, read_identity
-from dexsim_real.wire.serial_hand import SerialHand, open_port
+from dexsim_real.wire.link import Identity, LinkCounts, SerialHand, check_identity, read_identity
 
 serial = pytest.importorskip("serial")
 

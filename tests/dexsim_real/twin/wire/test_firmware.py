@@ -13,7 +13,7 @@ from twin_plant import ScriptedPlant
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
-from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
+from dexsim_real.twin.wire import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, check_identity, read_identity
@@ -75,7 +75,7 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     board = Firmware(plant)
     for degrees, hot in ((85.0, False), (100.0, True), (89.0, True), (84.0, False)):
         plant.heat[4] = degrees
-        state = frames.decode_state(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
+        state = frames.decode(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]

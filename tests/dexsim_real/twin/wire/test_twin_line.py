@@ -11,11 +11,10 @@ from twin_pair import Cable, Running, command, request
 from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.firmware import Terminal
+from dexsim_real.twin.wire import Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
-from dexsim_real.wire.link import LinkConfig
-from dexsim_real.wire.serial_hand import SerialHand
+from dexsim_real.wire.link import LinkConfig, SerialHand
 
 
 def test_an_exchange_takes_what_it_takes_on_the_hand_and_comes_in_pieces():

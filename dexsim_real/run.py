@@ -1,6 +1,10 @@
-"""A run on the hand: connect, tare, approach, run the policy, and end with the motors off.
+"""Runs a policy on the hand: connects, tares, approaches, runs the policy, and ends with the motors off.
 
-`run_policy` is a whole run as one call, for programs and notebooks; `python -m dexsim_real.run` is the same call.
+    python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
+
+The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The program
+asks before the motors come on (`--yes` does not). They come on at the measured pose, and go off at the end of the
+program, even after a failure. `run_policy` is the same as one call, for programs and notebooks.
 """
 
 import contextlib
@@ -9,35 +13,41 @@ import gc
 import hashlib
 import sys
 import termios
+import threading
 import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO, cast
 
 import jax
 import numpy as np
 import tyro
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from dexsim import load_hand
 from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
 from dexsim.core.config import setting, to_dict
+from dexsim.hand.description import Hand
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import Controller, Tick, prepare_jax
+from dexsim_real.control.controller import Controller, PolicyLoop, Tick, limits_for, prepare_jax
 from dexsim_real.control.guard import Guard
-from dexsim_real.control.policy_loop import PolicyLoop, limits_for
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import ignore_signals, leave_realtime, stopping, use_realtime
+from dexsim_real.core.process import BACKGROUND, change_priority, ignore_signals, leave_realtime, stopping, use_realtime
 from dexsim_real.loop import LoopOptions, LoopThread, Pace, Timing, keep_phase
-from dexsim_real.run.status import StatusView, hand_tables
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
-from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing
 from dexsim_real.sensors.imu import UPRIGHT_X, Imu
+from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.link import UNCONFIRMED
-from dexsim_real.wire.serial_hand import open_port
 
 _SWITCH = sys.getswitchinterval()
 _QUESTION = (
@@ -47,6 +57,8 @@ _QUESTION = (
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 _BLIND = 0.1  # share of the time without a measurement that a run may have, such as a cable that was out for a moment
 _HELD = 0.5  # share of the time in which `Safety` may have held the hand
+
+_LIVE = 0.25  # s between two updates of the tables
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,7 +168,6 @@ def execute(arguments: RunArguments) -> RunResult:
     reason, code = "", 0
     try:
         try:
-            session.prepare()
             session.run()
         except HandError as error:
             reason, code = str(error), 1
@@ -214,7 +225,7 @@ class Outcome:
 
 
 class Session:
-    """A run: the constructor opens only files, `prepare` connects with the motors off, `run` turns them on.
+    """A run: the constructor opens only files, `run` connects.
 
     Raises DexsimError: the policy, calibration or log cannot be used.
     """
@@ -240,7 +251,7 @@ class Session:
         self.loop = LoopThread(self.port, self.sensing, self.safety, rate, guard)
         self.loop.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", self.summary, self._hand_tables, arguments.quiet)
-        self.policy: PolicyLoop | None = None  # from `prepare` on
+        self.policy: PolicyLoop | None = None  # once the hand is connected
         self.pace = Pace(policy.control_rate)
         self.started = 0.0
         self.outcome = Outcome()
@@ -249,10 +260,11 @@ class Session:
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
-    def prepare(self) -> None:
-        """Connect with the motors off, tare the taxels, start camera and IMU.
+    def run(self) -> None:
+        """Connect with the motors off and tare, ask, turn the motors on, approach the start posture, and run the policy
+        until time or `Safety` ends it.
 
-        Raises HandError: something is missing or does not answer.
+        Raises HandError: something is missing, the answer was not yes, or `Safety` or a failure ended the run.
         """
         arguments, sensing = self.arguments, self.sensing
         for line in self.port.greet(sensing.hand, sensing.calibration):
@@ -262,7 +274,7 @@ class Session:
         self._write_meta()
         self.loop.start()
         self._await_pose()
-        self.policy = PolicyLoop(
+        self.policy = policy = PolicyLoop(
             self.controller,
             self.safety,
             open_objects(arguments, self.controller),
@@ -271,14 +283,7 @@ class Session:
             place_seconds=arguments.place,
             motors_off=arguments.motors_off,
         )
-
-    def run(self) -> None:
-        """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
-
-        Raises HandError: the answer was not yes, or `Safety` or a failure ended the run.
-        """
-        assert self.policy is not None, "`prepare` comes first"
-        if not (self.arguments.yes or self.arguments.motors_off):
+        if not (arguments.yes or arguments.motors_off):
             self.view.show()
             ask()
             self._await_pose()  # The hand may have been moved or lost meanwhile.
@@ -286,16 +291,16 @@ class Session:
         gc.collect()
         gc.freeze()
         with self.view:
-            if not self.arguments.motors_off:
+            if not arguments.motors_off:
                 self.loop.engage()
                 self._await_motors()
-            pace = Pace(self.arguments.rate)
-            while self.policy.approach(time.monotonic()):
+            pace = Pace(arguments.rate)
+            while policy.approach(time.monotonic()):
                 self._check()
                 pace.wait()
-            self.policy.begin()
+            policy.begin()
             self._note("the policy starts")
-            self._run_policy(self.policy)
+            self._run_policy(policy)
             self.end = "time is over"
 
     def close(self, reason: str = "") -> None:
@@ -389,7 +394,8 @@ class Session:
             if tick is not None:
                 self.newest = tick
                 fields = {name: getattr(tick, name) for name in ("observation", "action", "target")}
-                fields |= {"sequence": policy.sample.sequence, "age": now - policy.sample.time}
+                sample = policy.sample
+                fields |= {"sequence": sample.sequence, "age": now - sample.time, "answer": sample.state.tobytes()}
                 self.log.add(Kind.TICK, fields | {"readings": vars(tick.readings)}, now)
             self.pace.wait()
         self._check()
@@ -455,11 +461,11 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
     if "camera" in needed and not (arguments.camera or arguments.fixed_object):
         raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
-    reference = np.asarray(spec.reference, float)
     objects = ObjectSensors(spec.reference, spec.gravity)
     try:
         if arguments.camera:
             masks = open_masks(arguments.camera, arguments.optics)
+            reference = np.asarray(spec.reference, float)
             objects.camera = HeightSensor(masks, arguments.optics, reference, spec.object_axes, spec.velocity_filter)
         if arguments.imu:
             objects.imu = imu = Imu(arguments.imu, arguments.imu_mount)
@@ -468,3 +474,169 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         objects.close()
         raise
     return objects
+
+
+# --- the status on the terminal ---------------------------------------------------------------------
+
+
+class _Lasting:
+    """A stream to which writing never fails: a terminal that was closed, or a pipe without a reader, ends no run."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+
+class StatusView:
+    """Shows the state of a run from a background thread, which calls `summary` and `hand`. A context manager."""
+
+    def __init__(
+        self,
+        title: str,
+        summary: Callable[[], dict[str, Any]],
+        hand: Callable[[], Table | str],
+        quiet: bool = False,
+    ):
+        self.console = _console(quiet)
+        self._title, self._summary, self._hand = title, summary, hand
+        live = self.console.is_terminal and not quiet
+        self._live = Live(console=self.console, auto_refresh=False, transient=True) if live else None
+        self._notes: deque[str] = deque(maxlen=1000)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+
+    def __enter__(self) -> "StatusView":
+        if self._live:
+            self._live.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(2.0)
+        if self._live:
+            self._live.stop()
+
+    def note(self, text: str) -> None:
+        """Print a line. While the view runs, its thread does, so the caller never waits for a terminal."""
+        self._notes.append(text)
+        if not self._thread.is_alive():
+            self._print_notes()
+
+    def show(self) -> None:
+        """Print the tables once."""
+        self.console.print(self._tables())
+
+    def _print_notes(self) -> None:
+        with contextlib.suppress(IndexError):  # Another thread may have printed the last one.
+            while True:
+                self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
+
+    def _run(self) -> None:
+        change_priority(BACKGROUND)
+        while not self._stop.wait(_LIVE):
+            self._print_notes()
+            if self._live:
+                self._live.update(self._tables(), refresh=True)
+        self._print_notes()
+
+    def _tables(self) -> Group:
+        return Group(self._hand(), "", _rows(self._title, self._summary()))
+
+
+def show_summary(title: str, summary: dict[str, Any]) -> None:
+    """Print nested results as a table on the standard error."""
+    _console().print(_rows(title, summary))
+
+
+def _console(quiet: bool = False) -> Console:
+    stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
+    return Console(stderr=True, quiet=quiet, file=stream)
+
+
+def _rows(title: str, summary: dict[str, Any]) -> Table:
+    """A row for each entry that says something."""
+
+    def short(value: Any) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    # Escaped, since an error may have text in brackets, which Rich would take for its markup.
+    table = Table(title=escape(title), title_justify="left", show_header=False, box=None)
+    for name, value in summary.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{k} {short(v)}" for k, v in value.items() if v)
+        if value not in ("", []):
+            table.add_row(name.replace("_", " "), escape(short(value)))
+    return table
+
+
+def hand_tables(hand: Hand, measured: HandMeasurement, target: np.ndarray | None, sent: bool) -> Table:
+    """Joints on the left, with the error registers of their boards; fingertips on the right.
+
+    `target` [J] rad are the newest joint targets, None before the first; `sent` tells whether the motors follow them.
+    """
+    heat, force = measured.temperature, measured.finger_force
+    title = "target" if sent else "(not sent)"
+    joints = _table("joint (rad)", "measured", title, "A", "degC", "errors: palm", "joint", "tip")
+    for joint, name in enumerate(hand.joint_names):
+        joints.add_row(
+            f"{joint:2d} {name}",
+            f"{measured.joint_position[joint]:.3f}",
+            "-" if target is None else f"{target[joint]:.3f}",
+            "-" if np.isnan(measured.current[joint]) else f"{measured.current[joint]:.2f}",
+            f"{heat[joint]:.0f}",
+            *(f"{bits:04x}" if bits else "-" for bits in measured.errors[joint]),
+        )
+    fingers = _table("finger", "N", "degC")
+    for name, newtons, degrees in zip(hand.finger_names, force, heat[hand.num_joints :], strict=False):
+        fingers.add_row(name, f"{newtons:.1f}", f"{degrees:.0f}")
+    fingers.add_row("sum", f"{force.sum():.1f}", "")
+    fingers.add_row("palm board", "", f"{heat[-1]:.0f}")
+    both = Table.grid(padding=(0, 3))
+    both.add_row(joints, fingers)
+    return both
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), collapse_padding=True, pad_edge=False, show_edge=False)
+    table.add_column(first, no_wrap=True)
+    for name in others:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+# --- the command ------------------------------------------------------------------------------------
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run or something is missing."""
+    arguments = cli.parse(RunArguments, argv, prog="python -m dexsim_real.run", description="Run a policy on the hand.")
+    inputs = {"policy": arguments.policy, "calibration": arguments.calibration, "TOML of the hand": arguments.hand}
+    cli.check_no_overwrite({"--log": arguments.log, "--output": arguments.output}, inputs)
+    if arguments.output:
+        cli.check_writable(arguments.output)
+    with stopping(leaving=argv is None):
+        result = execute(arguments)
+        if result.problem:
+            with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
+                print(f"error: {result.problem}", file=sys.stderr)
+        if not arguments.quiet:
+            show_summary(f"{arguments.policy}: {result.end}", result.summary)
+        if arguments.output:
+            cli.write_json(arguments.output, result.summary)
+    return result.code
+
+
+if __name__ == "__main__":
+    cli.run(main)

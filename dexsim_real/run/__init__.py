@@ -1,1 +1,0 @@
-"""`python -m dexsim_real.run`: run a policy on the hand."""
