@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import gc
 import hashlib
+import math
 import sys
 import termios
 import threading
@@ -88,6 +89,9 @@ class RunArguments(LoopOptions):
     """Serial port of the IMU in the object; None if the policy needs no IMU."""
     imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
     """Orientation (w, x, y, z) of the IMU in the object; by default its z is along the object's x."""
+    lean: tuple[float, ...] = setting((), unit="rad", low=-1.57, high=1.57)
+    """How much higher the wrist is than the fingers, and the thumb's side than the little finger's, by a level on the
+    palm; empty: as in training. An IMU measures it, too."""
     camera: str | None = None
     """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION. None if the policy needs
     no camera."""
@@ -114,6 +118,8 @@ class RunArguments(LoopOptions):
         super().__post_init__()
         if not any(self.imu_mount):
             raise HandError("--imu-mount 0 0 0 0: is no orientation (w, x, y, z)")
+        if len(self.lean) not in (0, 2):
+            raise HandError(f"--lean: expected 2 angles in rad, got {len(self.lean)}")
         if (self.calibration is None) != self.uncalibrated:
             raise HandError("give either --calibration FILE, or --uncalibrated to run on default scales")
 
@@ -461,7 +467,8 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
     if "camera" in needed and not (arguments.camera or arguments.fixed_object):
         raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
-    objects = ObjectSensors(spec.reference, spec.gravity)
+    gravity = gravity_of(arguments.lean, controller.hand, spec.gravity) if arguments.lean else spec.gravity
+    objects = ObjectSensors(spec.reference, gravity)
     try:
         if arguments.camera:
             masks = open_masks(arguments.camera, arguments.optics)
@@ -474,6 +481,13 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
         objects.close()
         raise
     return objects
+
+
+def gravity_of(lean: Sequence[float], hand: Hand, nominal: Sequence[float]) -> np.ndarray:
+    """Gravity's direction [3] in the palm frame where `--lean` is measured; palm up or down as in the `nominal` one [3]."""
+    along, across = math.sin(lean[0]), -math.sin(lean[1])  # z is toward the fingers, y toward a right hand's thumb
+    out = math.copysign(math.sqrt(max(1.0 - along**2 - across**2, 0.0)), nominal[0])
+    return np.array([out, across if hand.side == "right" else -across, along])
 
 
 # --- the status on the terminal ---------------------------------------------------------------------

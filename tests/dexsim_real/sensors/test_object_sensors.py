@@ -1,5 +1,6 @@
 """The object's sensors: height from masks; IMU frames, alignment, jumps and port; when a policy may begin."""
 
+import dataclasses
 import math
 import time
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from hypothesis import example, given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from dexsim_real.core.errors import HandError
+from dexsim_real.run import gravity_of
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, camera_axes, height_of
 from dexsim_real.sensors.imu import IDENTITY
@@ -235,3 +237,13 @@ def test_without_sensors_the_object_is_where_it_should_lie_and_the_palm_leans_as
     estimate, when = ObjectSensors(REFERENCE, (0.0, 3.0, -4.0)).read(2.5)
     assert when == 2.5
     np.testing.assert_allclose(np.concatenate(estimate), [*REFERENCE, *[0] * 3, *IDENTITY, 0.0, 0.6, -0.8])
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_measured_lean_gives_gravity_in_the_palm_frame(hand, side):
+    """Against the heights of wrist, fingers, thumb and little finger in the world; a left hand has its thumb at -y."""
+    thumb = 1.0 if side == "right" else -1.0
+    for turn in Rotation.random(20, random_state=1):
+        up = turn.inv().apply([0.0, 0.0, 1.0])  # palm frame: z toward the fingers
+        lean = [math.asin(-up[2]), math.asin(thumb * up[1])]
+        np.testing.assert_allclose(gravity_of(lean, dataclasses.replace(hand, side=side), -up), -up, atol=1e-9)
