@@ -19,7 +19,7 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
