@@ -33,11 +33,8 @@ def build_scene(
     backend: str,
 ) -> PhysicsScene:
     """The scene for an engine: hand, free object, explicit pairs, force sensors, and the addresses of what changes in
-    the model.
-
-    Raises:
-      AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the object.
-    """
+    the model. Raises AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the
+    object."""
     check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), hand.model_path)
     spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     touching = _touching_geoms(hand, slots)

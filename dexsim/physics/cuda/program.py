@@ -95,11 +95,7 @@ def _literal(value: Any, dtype: str) -> str:
 
 
 def source(scene: PhysicsScene, law: PrintedLaw) -> str:
-    """The kernel's source, which includes `headers`.
-
-    Raises:
-      AssetError: the scene has what the kernel lacks.
-    """
+    """The kernel's source, which includes `headers`."""
     args, constants = declare_args(buffers(scene, law.buffers)), kernel_constants(scene)
     return "\n".join(['#include "warp.cuh"', args, constants, law.text, '#include "tick.cuh"', _ENTRY])
 
@@ -116,9 +112,6 @@ def compile_kernel(text: str, architecture: str) -> bytes:
     Args:
       text: of `source`.
       architecture: of the GPU, such as sm_90.
-
-    Raises:
-      ConfigError: NVRTC is missing or fails.
     """
     compiler = find_compiler()
     options = (*OPTIONS, f"--gpu-architecture={architecture}")
@@ -172,11 +165,8 @@ class Compiler:
 
 @functools.cache
 def find_compiler() -> Compiler:
-    """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order.
-
-    Raises:
-      ConfigError: there is none.
-    """
+    """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order. Raises ConfigError: there
+    is none."""
     for path in _candidates():
         with contextlib.suppress(OSError):
             return Compiler(ctypes.CDLL(str(path)))

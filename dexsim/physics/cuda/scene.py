@@ -12,7 +12,7 @@ zero.
 import ctypes
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dexsim.core.errors import AssetError
+from dexsim.hand.load import rotation_matrix
 from dexsim.physics.interface import PhysicsScene
 
 LANES = 32
@@ -194,13 +195,6 @@ def find_links(scene: PhysicsScene) -> Links:
     return Links(link, rotation, place, parent, offset_rotation, offset_place)
 
 
-def rotation_matrix(quat: ArrayLike) -> np.ndarray:
-    """[3, 3] of a quaternion (w, x, y, z)."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
-    return matrix.reshape(3, 3)
-
-
 def _axes_along(axis: np.ndarray) -> np.ndarray:
     """A rotation whose third column is `axis`."""
     other = np.eye(3)[np.argmin(np.abs(axis))]
@@ -210,11 +204,7 @@ def _axes_along(axis: np.ndarray) -> np.ndarray:
 
 
 def kernel_constants(scene: PhysicsScene) -> str:
-    """The constants of a scene as C++.
-
-    Raises:
-      AssetError: the kernel cannot run the scene.
-    """
+    """The constants of a scene as C++."""
     check_scene(scene)
     links = find_links(scene)
     return "\n".join(
@@ -231,23 +221,32 @@ def kernel_constants(scene: PhysicsScene) -> str:
     )
 
 
-def _number(value: float) -> str:
-    """A C++ literal of a float32."""
-    return f"{np.float32(value):.9e}f"
+def _literal(value: Any) -> str:
+    """A whole number, a float32, or the braces of a row or array of these, in C++."""
+    if isinstance(value, (tuple, list, np.ndarray)):
+        return "{" + ", ".join(map(_literal, value)) + "}"
+    return f"{np.float32(value):.9e}f" if isinstance(value, (float, np.floating)) else str(value)
 
 
-def _array(name: str, values: ArrayLike, kind: str = "float") -> str:
-    """A C++ table [...] of device memory."""
+def _constants(values: dict[str, Any]) -> list[str]:
+    return [f"constexpr {_kind(value)} {name} = {_literal(value)};" for name, value in values.items()]
+
+
+def _array(name: str, values: ArrayLike) -> str:
+    """A table [...] of whole numbers or float32 in device memory."""
     array = np.asarray(values)
     sizes = "".join(f"[{n}]" for n in array.shape)
-    return f"__device__ const {kind} {name}{sizes} = {_list(array, _number if kind == 'float' else str)};"
+    return f"__device__ const {_kind(array.flat[0])} {name}{sizes} = {_literal(array)};"
 
 
-def _list(values: ArrayLike, literal: Callable[[Any], str] = _number) -> str:
-    """The braces of an array [...] of float32, or of what else `literal` prints."""
-    if np.ndim(values):
-        return "{" + ", ".join(_list(row, literal) for row in np.asarray(values)) + "}"
-    return literal(np.asarray(values).item())
+def _table(kind: str, name: str, rows: Sequence[tuple]) -> list[str]:
+    """A table of structs, with one row of zeros where there is none."""
+    lines = [f"  {_literal(row)}," for row in rows or [()]]
+    return [f"__device__ const {kind} {name}[{len(lines)}] = {{", *lines, "};"]
+
+
+def _kind(number: Any) -> str:
+    return "float" if isinstance(number, (float, np.floating)) else "int"
 
 
 def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
@@ -256,7 +255,7 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
     first = last = np.zeros(links.hinges, int)
     if blocks is not None:
         first, last = np.searchsorted(blocks, blocks), np.searchsorted(blocks, blocks, side="right") - 1
-    sizes = {
+    sizes: dict[str, Any] = {
         "HINGES": links.hinges,
         "CHAIN": max(map(len, chains)),
         # Hinges of a finger if every finger is one chain of few; 0: the hand is eliminated as a whole.
@@ -267,19 +266,18 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
         "FINGERS": scene.hand.num_fingers,
         "MAX_CONTACTS": MAX_CONTACTS,
     }
-    numbers = {"TIMESTEP": option.timestep, "IMPRATIO": option.impratio}
-    numbers |= {f"GRAVITY_{axis}": value for axis, value in zip("XYZ", option.gravity, strict=True)}
+    sizes |= {"TIMESTEP": option.timestep, "IMPRATIO": option.impratio}
+    sizes |= {f"GRAVITY_{axis}": value for axis, value in zip("XYZ", option.gravity, strict=True)}
     return [
-        *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
-        *(f"constexpr float {name} = {_number(value)};" for name, value in numbers.items()),
-        _array("PARENT", _lanes(links.parent, -1), "int"),
-        _array("DEPTH", _lanes([len(chain) - 1 for chain in chains]), "int"),
-        _array("BLOCK_FIRST", _lanes(first), "int"),
-        _array("BLOCK_LAST", _lanes(last), "int"),
-        f"constexpr int GATHER_STEPS = {len(steps)};",
-        _array("GATHER_FROM", np.array([_lanes(step, -1) for step in steps] or [_lanes([], -1)]), "int"),
-        _array("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in chains), 0], "int"),
-        _array("CHAIN_HINGE", [chain + [-1] * (sizes["CHAIN"] - len(chain)) for chain in chains], "int"),
+        *_constants(sizes),
+        _array("PARENT", _lanes(links.parent, -1)),
+        _array("DEPTH", _lanes([len(chain) - 1 for chain in chains])),
+        _array("BLOCK_FIRST", _lanes(first)),
+        _array("BLOCK_LAST", _lanes(last)),
+        *_constants({"GATHER_STEPS": len(steps)}),
+        _array("GATHER_FROM", [_lanes(step, -1) for step in steps or [[-1]]]),
+        _array("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in chains), 0]),
+        _array("CHAIN_HINGE", [chain + [-1] * (sizes["CHAIN"] - len(chain)) for chain in chains]),
     ]
 
 
@@ -315,7 +313,7 @@ def _joints(scene: PhysicsScene) -> list[str]:
     drive = np.full(len(joint), -1)
     drive[scene.joint_dof] = np.arange(len(scene.joint_dof))
     return [
-        _array("DRIVE", _lanes(drive, -1), "int"),
+        _array("DRIVE", _lanes(drive, -1)),
         _array("ARMATURE", _lanes(model.dof_armature[: len(joint)])),
         _array("DAMPING", _lanes(model.dof_damping[: len(joint)])),
         _array("STIFFNESS", _lanes(model.jnt_stiffness[joint])),
@@ -333,16 +331,11 @@ def _couplings(model: mujoco.MjModel) -> list[str]:
     zero = [np.where(dof >= 0, model.qpos0[dof], 0.0) for dof in (first, second)]
     compliance = model.dof_invweight0[first] + np.where(second >= 0, model.dof_invweight0[second], 0.0)
     springs = np.hstack([model.eq_solref, model.eq_solimp])
+    couplings = zip(first, second, np.transpose(zero), model.eq_data[:, :5], springs, compliance, strict=True)
     return [
         f"constexpr int COUPLINGS = {model.neq};",
         "struct Coupling { int first, second; float zero[2], polynomial[5], spring[7], compliance; };",
-        f"__device__ const Coupling COUPLING[{max(model.neq, 1)}] = {{",
-        *(
-            f"  {{{first[k]}, {second[k]}, {_list([zero[0][k], zero[1][k]])}, {_list(model.eq_data[k, :5])}, "
-            f"{_list(springs[k])}, {_number(compliance[k])}}},"
-            for k in range(model.neq)
-        ),
-        "};",
+        *_table("Coupling", "COUPLING", list(couplings)),
     ]
 
 
@@ -353,7 +346,7 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
     compliance = model.body_invweight0[bodies, 0].sum(0)
     fingers = {int(body): finger for finger, body in enumerate(scene.tip_bodies)}
     rows = {int(pair): row for row, pair in enumerate(scene.object_pairs)}
-    lines: list[str] = []
+    table: list[tuple] = []
     springs: list[list[float]] = []
     for pair, (one, two) in enumerate(bodies.T):
         first, second, side = int(links.link[one]), int(links.link[two]), 1.0
@@ -363,13 +356,13 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
         row = rows.get(pair, -1 - len(springs))
         if row < 0:
             springs.append([model.pair_friction[pair, 0], *model.pair_solref[pair], *model.pair_solimp[pair]])
-        lines.append(f"{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}")
+        table.append((first, second, row, finger, side, compliance[pair]))
     return [
         "// Links (the object's last), row among the object's pairs (or -1 - that among the others), finger whose tip",
         "// presses on the object, -1 where the object is the pair's first, inverse weights of both bodies in 1/kg.",
         "struct Pair { int first, second, row, finger; float side, compliance; };",
-        *_table("Pair", "PAIR", lines),
-        _array("HAND_SPRING", np.array(springs or np.zeros((1, 8)))),
+        *_table("Pair", "PAIR", table),
+        _array("HAND_SPRING", springs or np.zeros((1, 8))),
     ]
 
 
@@ -397,7 +390,7 @@ def _spread(centre: np.ndarray) -> np.ndarray:
     return np.dot(centre, centre) * np.eye(3) - np.outer(centre, centre)
 
 
-def _kind(scene: PhysicsScene, geom: int) -> str:
+def _kind_of(scene: PhysicsScene, geom: int) -> str:
     return mujoco.mjtGeom(scene.model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
 
 
@@ -420,7 +413,7 @@ def _sort_pairs(
     hand: list[tuple[int, int, int]] = []
     lacking = []
     for pair, (first, second) in enumerate(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)):
-        kind, other = _kind(scene, first), _kind(scene, second)
+        kind, other = _kind_of(scene, first), _kind_of(scene, second)
         with_object = second in primitive
         if other not in _ON_OBJECT.get(kind, ()) if with_object else not {kind, other} <= set(_ROUND):
             lacking.append(f"{kind} {model.geom(first).name!r} on {other} {model.geom(second).name!r}")
@@ -467,48 +460,38 @@ def _contacts(scene: PhysicsScene, links: Links) -> list[str]:
     sizes["EXTRA_CONTACTS"] = _EXTRA if scene.slots.count("box") > 1 else 0
     sized = {int(geom): len(scene.slots) + k for k, geom in enumerate(scene.tip_geoms)}
 
-    def place(geom: int) -> tuple[str, int, np.ndarray]:
-        """Place of a geom in its link's frame in C++, its link, its rotation [3, 3]."""
+    def place(geom: int) -> tuple[np.ndarray, int, np.ndarray]:
+        """Place of a geom in its link's frame, its link, its rotation [3, 3]."""
         body = model.geom_bodyid[geom]
         centre = links.place[body] + links.rotation[body] @ model.geom_pos[geom]
         link = links.link[body] if links.link[body] >= 0 else links.hinges
-        return _list(centre), int(link), links.rotation[body] @ rotation_matrix(model.geom_quat[geom])
+        return centre, int(link), links.rotation[body] @ rotation_matrix(model.geom_quat[geom])
 
     round_rows, box_rows, plane_rows = [], [], []
     for geom in round_geoms:
         at, link, turn = place(geom)
-        half = model.geom_size[geom, 1] if _kind(scene, geom) == "capsule" else 0.0
-        radius = _number(model.geom_size[geom, 0])
-        round_rows.append(f"{at}, {link}, {_list(half * turn[:, 2])}, {radius}, {sized.get(geom, -1)}")
+        half = model.geom_size[geom, 1] if _kind_of(scene, geom) == "capsule" else 0.0
+        round_rows.append((at, link, half * turn[:, 2], model.geom_size[geom, 0], sized.get(geom, -1)))
     for geom in geoms["box"]:
         at, link, turn = place(geom)
-        box_rows.append(f"{at}, {link}, {_list(turn)}, {_list(model.geom_size[geom])}, {sized.get(geom, -1)}")
+        box_rows.append((at, link, turn, model.geom_size[geom], sized.get(geom, -1)))
     for geom in geoms["plane"]:
         at, _, turn = place(geom)
-        plane_rows.append(f"{at}, {_list(turn[:, 2])}")
+        plane_rows.append((at, turn[:, 2]))
     index = {geom: k for k, geom in enumerate(round_geoms)}
-    pair_rows = [f"{index[one]}, {index.get(two, two)}, {pair}" for one, two, pair in round_pairs]
+    pair_rows = [(index[one], index.get(two, two), pair) for one, two, pair in round_pairs]
     points = [
-        f"{plane}, {k}, {_PRIMITIVES.index(kind)}, {corner}"
+        (plane, k, _PRIMITIVES.index(kind), corner)
         for plane in range(len(plane_rows))
         for k, kind in enumerate(scene.slots)
         for corner in range(_PLANE_POINTS[kind])
     ]
     return [
-        *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
+        *_constants(sizes),
         *_table("RoundGeom", "ROUND_GEOM", round_rows),
         *_table("BoxGeom", "BOX_GEOM", box_rows),
         *_table("PlaneGeom", "PLANE_GEOM", plane_rows),
         *_table("RoundPair", "ROUND_PAIR", pair_rows),
         *_table("PlanePoint", "PLANE_POINT", points),
-        _array("OBJECT_PAIR", object_pair, "int"),
-    ]
-
-
-def _table(kind: str, name: str, rows: list[str]) -> list[str]:
-    """A table of structs, with one row of zeros where there is none."""
-    return [
-        f"__device__ const {kind} {name}[{max(len(rows), 1)}] = {{",
-        *(f"  {{{row}}}," for row in rows or [""]),
-        "};",
+        _array("OBJECT_PAIR", object_pair),
     ]

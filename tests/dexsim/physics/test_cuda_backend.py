@@ -15,7 +15,7 @@ from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi, physics as engines
-from dexsim.physics.cuda import backend, launch, program
+from dexsim.physics.cuda import backend, program
 from dexsim.physics.physics import Physics
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -47,10 +47,10 @@ def emulated(monkeypatch):
         KERNELS[name] = emulation, settings
         return name
 
-    ffi.register(launch.TARGET, "cpu", serve)
+    ffi.register(backend.TARGET, "cpu", serve)
     monkeypatch.setattr(engines, "_on_nvidia", lambda: True)
-    monkeypatch.setattr(launch, "architecture", lambda: "sm_90")
-    monkeypatch.setattr(launch, "load", load)
+    monkeypatch.setattr(backend, "architecture", lambda: "sm_90")
+    monkeypatch.setattr(backend, "load", load)
     monkeypatch.setattr(backend, "find_compiler", lambda: None)
     monkeypatch.setattr(backend, "source", lambda scene, law: (scene, law))
     monkeypatch.setattr(backend, "compile_kernel", lambda text, architecture: text)
@@ -106,7 +106,7 @@ def test_tasks_compile(task, emulated, monkeypatch):
     texts = []
     monkeypatch.setattr(backend, "source", program.source)
     monkeypatch.setattr(backend, "compile_kernel", lambda text, _: texts.append(text))
-    monkeypatch.setattr(launch, "load", lambda *_: "0")
+    monkeypatch.setattr(backend, "load", lambda *_: "0")
     env = dexsim.make(task, backend="c")
     states = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 1))
     for _ in range(2):

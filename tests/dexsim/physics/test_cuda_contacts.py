@@ -10,6 +10,7 @@ import warp_emulation
 from physics_states import scene_of_model
 from scipy.spatial.transform import Rotation
 
+from dexsim.hand.load import rotation_matrix
 from dexsim.physics.cuda.scene import (
     MAX_CONTACTS,
     Buffer,
@@ -17,7 +18,6 @@ from dexsim.physics.cuda.scene import (
     declare_args,
     find_links,
     kernel_constants,
-    rotation_matrix,
 )
 from dexsim.physics.interface import PhysicsScene
 
