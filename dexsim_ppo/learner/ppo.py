@@ -166,11 +166,7 @@ def average_weights(average: tuple, params: Params, iteration: jax.Array) -> tup
 
 def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
     """The next scale [] of the curriculum, in [0, 1], and the success [] of this iteration. A NaN success (no episode
-    has ended) leaves the scale unchanged.
-
-    Raises:
-      ConfigError: the curriculum names a metric that does not exist.
-    """
+    has ended) leaves the scale unchanged. Raises ConfigError: the curriculum names a metric that does not exist."""
     if not curriculum.metric:
         success = 1 - metrics["terminated_share"]
     elif curriculum.metric in metrics:
