@@ -448,15 +448,15 @@ class Search:
 
     def _settle(self, last: bool) -> None:
         """Solve to the end, and take each channel's noise from what the fit leaves."""
-        self.best = np.inf
+        self.best, rugged = np.inf, self.dead_band is not None
         self._attempt(self.theta, 30)
-        if not last:
+        if rugged and not last:
             self._explore(rounds=6)
         left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
         self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
         if last:
             self.best = np.sum(self.residual(self.theta, self.starts) ** 2)
-            self._explore(rounds=14)
+            self._explore(rounds=14 if rugged else 3)
 
     def _explore(self, rounds: int, crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
