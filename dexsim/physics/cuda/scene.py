@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.load import rotation_matrix
-from dexsim.physics.interface import PhysicsScene
+from dexsim.physics.interface import PhysicsScene, places
 
 LANES = 32
 MAX_CONTACTS = 32
@@ -77,27 +77,17 @@ def args_type(count: int) -> type[ctypes.Structure]:
 
 def buffers(scene: PhysicsScene, law: Sequence[Buffer]) -> list[Buffer]:
     """Arguments of the kernel in order, arrays [N, size]: inputs, the motor law's constants, outputs."""
-    model, slots, pairs = scene.model, len(scene.slots), len(scene.object_pairs)
+    model = scene.model
+    sizes = {name: np.size(getattr(model, name)[place]) for name, place in places(scene).items()}
+    del sizes["geom_rbound"]  # the kernel has no broad phase
+    sizes["pair_friction"] //= 2  # the same in both directions
+    moving = {"qpos": model.nq, "qvel": model.nv, "warmstart": model.nv}
+    results = {f"{name}_out": size for name, size in moving.items()}
+    results |= {"finger_force": 3 * scene.hand.num_fingers, "stats": 4}
     return [
-        Buffer("qpos", model.nq),
-        Buffer("qvel", model.nv),
-        Buffer("warmstart", model.nv),
-        Buffer("push", 3),
-        Buffer("body_mass", 1),
-        Buffer("body_inertia", 3),
-        Buffer("body_ipos", 3),
-        Buffer("geom_size", 3 * (slots + len(scene.tip_geoms))),
-        Buffer("geom_pos", 3 * slots),
-        Buffer("geom_quat", 4 * slots),
-        Buffer("pair_friction", pairs),
-        Buffer("pair_solref", 2 * pairs),
-        Buffer("pair_solimp", 5 * pairs),
+        *(Buffer(name, size) for name, size in (moving | {"push": 3} | sizes).items()),
         *law,
-        Buffer("qpos_out", model.nq, output=True),
-        Buffer("qvel_out", model.nv, output=True),
-        Buffer("warmstart_out", model.nv, output=True),
-        Buffer("finger_force", 3 * scene.hand.num_fingers, output=True),
-        Buffer("stats", 4, output=True),
+        *(Buffer(name, size, output=True) for name, size in results.items()),
     ]
 
 
