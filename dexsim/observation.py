@@ -186,11 +186,6 @@ def mirror_readings(readings: Readings) -> Readings:
     )
 
 
-def mirror_motion(motion: Motion) -> Motion:
-    """The motion in the mirrored scene."""
-    return Motion(motion.joint_velocity, motion.object_spin * AXIAL)
-
-
 def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[LayoutEntry, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
     joints, vector, quat = (jnp.zeros(size) for size in (hand.num_joints, 3, 4))
@@ -231,7 +226,8 @@ def observe(
       [sum of the layout's sizes] float32, not normalised.
     """
     if hand.side == "left":
-        return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion and mirror_motion(motion))
+        motion = motion and Motion(motion.joint_velocity, motion.object_spin * AXIAL)
+        return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion)
     return jnp.concatenate(_compute(hand, readings, names, config, motion, pose)).astype(jnp.float32)
 
 
