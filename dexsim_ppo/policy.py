@@ -111,8 +111,8 @@ class Policy(Config):
         if unknown := sorted(set(names) - set(known)):
             raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(known)}")
         out = np.concatenate([np.full(entry.size, entry.name in names) for entry in self.observation_layout])
-        # Normalised observations have mean 0: an infinite deviation leaves nothing else.
-        std = jnp.where(out, jnp.inf, self.params.normalizer.std)
+        # Normalised observations have mean 0: the largest deviation leaves nothing else.
+        std = jnp.where(out, np.finfo(np.float32).max, self.params.normalizer.std)
         normalizer = dataclasses.replace(self.params.normalizer, std=std)
         return dataclasses.replace(self, params=dataclasses.replace(self.params, normalizer=normalizer))
 
