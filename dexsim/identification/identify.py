@@ -413,7 +413,6 @@ class Search:
             np.concatenate([theta[:count], self.starts]) / scale,
             jac=lambda x: self.jacobian(*split(x), count) * scale,
             bounds=(low, high),
-            method="trf",
             xtol=1e-6,
             ftol=1e-7,
             gtol=1e-10,
@@ -421,9 +420,9 @@ class Search:
         )
         return 2.0 * float(result.cost), *split(result.x)
 
-    def _attempt(self, theta: np.ndarray, evaluations: int, fixed: int = 0) -> float:
+    def _attempt(self, theta: np.ndarray, evaluations: int) -> float:
         """Sum of squares that is reached from here; keeps the solution if it is the best."""
-        cost, theta, starts = self.solve(theta, evaluations, fixed)
+        cost, theta, starts = self.solve(theta, evaluations)
         if cost < self.best:
             self.best, self.theta, self.starts = cost, theta, starts
         return cost
