@@ -25,8 +25,10 @@ _INTERNAL = 13
 _DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 9: np.uint64, 11: np.float32, 12: np.float64}
 
 
-def _struct(name: str, *fields: tuple[str, Any]) -> Any:
-    head = [("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
+_SIZE, _EXTENSION = ("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)
+
+
+def _struct(name: str, *fields: tuple[str, Any], head: tuple[tuple[str, Any], ...] = (_SIZE, _EXTENSION)) -> Any:
     return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields]})
 
 
@@ -68,26 +70,15 @@ Frame = _struct(
     ("results", Buffers),
     ("attributes", _Attributes),
 )
-
-
-class _Span(ctypes.Structure):
-    _fields_ = [("data", ctypes.c_void_p), ("size", ctypes.c_size_t)]
-
-    def read(self) -> bytes:
-        return ctypes.string_at(self.data, self.size)
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32)]
-
-
-class _MetadataRequest(ctypes.Structure):
-    _fields_ = [
-        ("struct_size", ctypes.c_size_t),
-        ("type", ctypes.c_int),
-        ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),
-    ]
+_Span = _struct("_Span", ("data", ctypes.c_void_p), ("size", ctypes.c_size_t), head=())
+_Metadata = _struct("_Metadata", ("version", _Version), ("traits", ctypes.c_uint32), head=(_SIZE,))
+_MetadataRequest = _struct(
+    "_MetadataRequest",
+    ("type", ctypes.c_int),
+    ("next", ctypes.c_void_p),
+    ("metadata", ctypes.POINTER(_Metadata)),
+    head=(_SIZE,),
+)
 
 
 def addresses(buffers: Any) -> list[int]:
@@ -107,12 +98,14 @@ def arrays(buffers: Any) -> list[np.ndarray]:
 
 def attributes(frame: Any) -> dict[str, bytes]:
     """The call's attributes that are strings."""
-    fields, strings = frame.attributes, {}
-    for index in range(fields.size):
-        if fields.types[index] == _STRING:
-            name = _Span.from_address(fields.names[index]).read().decode()
-            strings[name] = _Span.from_address(fields.items[index]).read()
-    return strings
+
+    def read(address: int) -> bytes:
+        span = _Span.from_address(address)
+        return ctypes.string_at(span.data, span.size)
+
+    fields = frame.attributes
+    strings = [index for index in range(fields.size) if fields.types[index] == _STRING]
+    return {read(fields.names[index]).decode(): read(fields.items[index]) for index in strings}
 
 
 def stream(frame: Any) -> int:
