@@ -9,8 +9,6 @@ Shapes: n nodes along each axis. Units: m.
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,11 +62,6 @@ def from_distances(axes: list[np.ndarray], distance: np.ndarray) -> Grid:
         spacing=jnp.asarray([a[1] - a[0] for a in axes], jnp.float32),
         scale=jnp.ones(()),
     )
-
-
-def scaled(grid: Grid, scale: jax.Array | float) -> Grid:
-    """The object `scale` [] times as large; the values stay shared under `vmap`."""
-    return dataclasses.replace(grid, scale=jnp.asarray(scale, jnp.float32))
 
 
 def signed_distance(points: jax.Array, grid: Grid) -> jax.Array:

@@ -8,7 +8,6 @@ Shapes: N points. Units: m.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
@@ -59,11 +58,6 @@ def from_shape(shape: sdf.Shape, count: int = COUNT) -> SurfacePoints:
         position.append(jnp.where((buried | ~shape.active[k])[:, None], _OUT_OF_THE_WAY, place))
         normal.append(jnp.einsum("ij,nj->ni", turn, out, precision="highest"))
     return SurfacePoints(jnp.concatenate(position), jnp.concatenate(normal))
-
-
-def scaled(surface: SurfacePoints, factor: jax.Array | float) -> SurfacePoints:
-    """The points of an object that is `factor` [] times as large."""
-    return dataclasses.replace(surface, position=factor * surface.position)
 
 
 def signed_distance(points: jax.Array, surface: SurfacePoints) -> jax.Array:

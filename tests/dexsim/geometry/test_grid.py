@@ -1,5 +1,7 @@
 """Meshes against closed forms and brute force; baked grids against exact distances; what is refused, and why."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -147,7 +149,7 @@ def test_values_are_scipys_interpolation():
     inside = np.clip(at, 0, n - 1)
     wanted = reference(inside) + np.linalg.norm((at - inside) * step, axis=1)
     for scale in (1.0, 2.0, 0.5):
-        own, here = grid.scaled(baked, scale), np.float32(scale * (origin + at * step))
+        own, here = dataclasses.replace(baked, scale=jnp.float32(scale)), np.float32(scale * (origin + at * step))
         value, normal = distance_and_normal(here, own)
         np.testing.assert_allclose(value, scale * wanted, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-5)
