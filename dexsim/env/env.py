@@ -27,7 +27,7 @@ from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.geometry import grid, rotations, surface_points
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics
 from dexsim.objects.config import ObjectConfig, load_mesh_object
