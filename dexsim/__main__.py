@@ -34,11 +34,7 @@ WITHOUT_JAX = ("demo", "view")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command. Returns its exit code.
-
-    Raises:
-      ConfigError: no such command.
-    """
+    """Run a command. Returns its exit code. Raises ConfigError: no such command."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
         print("usage: dexsim COMMAND [options]\n")

@@ -223,7 +223,7 @@ def report(path: Path) -> tuple[list[str], bool]:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckHandArguments:
-    """Options of `python -m dexsim.check_hand`."""
+    """Check the TOML of a hand and the files that it names."""
 
     hand: Annotated[Path, tyro.conf.Positional]
     """The TOML of a hand, or the name of a shipped one."""
@@ -233,8 +233,7 @@ class CheckHandArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns 0 if the hand passes, else 1."""
-    description = "Check the TOML of a hand and the files that it names."
-    arguments = cli.parse(CheckHandArguments, argv, prog="python -m dexsim.check_hand", description=description)
+    arguments = cli.parse(CheckHandArguments, argv)
     lines, passed = report(arguments.hand)
     print("\n".join(lines), flush=True)
     if passed and arguments.view:

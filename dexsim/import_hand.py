@@ -42,7 +42,7 @@ _DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 @dataclass(frozen=True, kw_only=True)
 class ImportArguments(Config):
-    """Options of `python -m dexsim.import_hand`."""
+    """Make a hand's folder from a maker's URDF or MJCF."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """The maker's URDF or MJCF; with --mirror also a hand's TOML, or the name of a shipped one. Meshes may be missing:
@@ -74,14 +74,8 @@ class ImportArguments(Config):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns 0 if the hand passes its checks, else 1.
-
-    Raises:
-      AssetError: the file cannot be imported; says why and what to do.
-      ConfigError: an option does not fit.
-    """
-    description = "Make a hand's folder from a maker's URDF or MJCF."
-    arguments = cli.parse(ImportArguments, argv, prog="python -m dexsim.import_hand", description=description)
+    """The command. Returns 0 if the hand passes its checks, else 1."""
+    arguments = cli.parse(ImportArguments, argv)
     path, passed = arguments.file, True
     with tempfile.TemporaryDirectory() as scratch:
         if not arguments.mirror or path.suffix in (".urdf", ".xml"):

@@ -16,10 +16,9 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
-from dexsim.geometry.mirror import AXIAL, POLAR, QUAT
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
-from dexsim.hand.mirror import mirror_hand
+from dexsim.hand.mirror import AXIAL, POLAR, QUAT, mirror_hand
 from dexsim.touch.reduce import ForceEstimate, estimate_force, reduce_touch_links
 
 
@@ -70,13 +69,11 @@ class ObservationField:
     """A named piece of an observation, a row of `_FIELDS`: all there is to know about it."""
 
     name: str
-    size: Callable[[Hand, str], int]
-    """How many values, for a hand and an encoding of orientations."""
     source: str
-    """Who measures it on a hand: "hand", "camera" or "imu"; "user", "policy" and "mount" know it themselves; "simulator"
+    """Who measures it on a hand: "hand", "camera" or "imu"; "user", "policy", "mount" know it themselves; "simulator"
     alone knows the rest, which is for critics."""
     compute: Callable[[Features], jax.Array]
-    """Its values [size]."""
+    """Its values, one axis."""
     scale: float | None = None
     """None for the running normaliser; a number divides the values instead. Touch has a fixed scale, since running
     statistics of a signal that is mostly zero explode at the first contact."""
@@ -99,41 +96,25 @@ def _fingertip_velocity(f: Features) -> jax.Array:
     return tip_twist(f.hand, f.readings.joint_position, f.motion.joint_velocity).ravel()
 
 
-def _joints(hand: Hand, encoding: str) -> int:
-    return hand.num_joints
-
-
-def _per_finger(count: int) -> Callable[[Hand, str], int]:
-    return lambda hand, encoding: count * hand.num_fingers
-
-
-def _fixed(count: int) -> Callable[[Hand, str], int]:
-    return lambda hand, encoding: count
-
-
-def _orientation(hand: Hand, encoding: str) -> int:
-    return 4 if encoding == "quaternion" else 6
-
-
 _FIELDS = (
-    ("joint_position", _joints, "hand", lambda f: f.readings.joint_position, None),
-    ("joint_torque", _joints, "hand", lambda f: f.readings.joint_torque, 0.3),
-    ("object_position", _fixed(3), "camera", lambda f: f.readings.object_position, None),
-    ("object_velocity", _fixed(3), "camera", lambda f: f.readings.object_velocity, None),
-    ("contact_force", _per_finger(1), "hand", lambda f: f.contact_force, 5.0),
-    ("contact_centre", _per_finger(3), "hand", lambda f: f.contact_centre.ravel(), 0.1),
-    ("finger_force", _per_finger(1), "hand", _finger_force, 5.0),
-    ("fingertip_position", _per_finger(3), "hand", lambda f: f.pose.tip_position.ravel(), None),
-    ("fingertip_rotation", _per_finger(6), "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(), None),
-    ("command", _fixed(1), "user", lambda f: f.readings.command[None], 0.5),
-    ("last_action", _joints, "policy", lambda f: f.readings.last_action, 1.0),
-    ("past_actions", lambda hand, _: 2 * hand.num_joints, "policy", lambda f: f.readings.past_actions.ravel(), 1.0),
-    ("palm_gravity", _fixed(3), "mount", lambda f: f.readings.palm_gravity, 1.0),
-    ("relative_orientation", _orientation, "imu", _relative_orientation, None),
-    ("object_orientation", _orientation, "imu", lambda f: _encode(f, f.readings.object_quat), None),
-    ("fingertip_velocity", _per_finger(6), "simulator", _fingertip_velocity, None),
-    ("joint_velocity", _joints, "simulator", lambda f: f.motion.joint_velocity, None),
-    ("object_spin", _fixed(3), "simulator", lambda f: f.motion.object_spin, None),
+    ("joint_position", "hand", lambda f: f.readings.joint_position, None),
+    ("joint_torque", "hand", lambda f: f.readings.joint_torque, 0.3),
+    ("object_position", "camera", lambda f: f.readings.object_position, None),
+    ("object_velocity", "camera", lambda f: f.readings.object_velocity, None),
+    ("contact_force", "hand", lambda f: f.contact_force, 5.0),
+    ("contact_centre", "hand", lambda f: f.contact_centre.ravel(), 0.1),
+    ("finger_force", "hand", _finger_force, 5.0),
+    ("fingertip_position", "hand", lambda f: f.pose.tip_position.ravel(), None),
+    ("fingertip_rotation", "hand", lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(), None),
+    ("command", "user", lambda f: f.readings.command[None], 0.5),
+    ("last_action", "policy", lambda f: f.readings.last_action, 1.0),
+    ("past_actions", "policy", lambda f: f.readings.past_actions.ravel(), 1.0),
+    ("palm_gravity", "mount", lambda f: f.readings.palm_gravity, 1.0),
+    ("relative_orientation", "imu", _relative_orientation, None),
+    ("object_orientation", "imu", lambda f: _encode(f, f.readings.object_quat), None),
+    ("fingertip_velocity", "simulator", _fingertip_velocity, None),
+    ("joint_velocity", "simulator", lambda f: f.motion.joint_velocity, None),
+    ("object_spin", "simulator", lambda f: f.motion.object_spin, None),
 )
 FIELDS = {row[0]: ObservationField(*row) for row in _FIELDS}
 """Every field by name; a row of `_FIELDS` each."""
@@ -205,15 +186,14 @@ def mirror_readings(readings: Readings) -> Readings:
     )
 
 
-def mirror_motion(motion: Motion) -> Motion:
-    """The motion in the mirrored scene."""
-    return Motion(motion.joint_velocity, motion.object_spin * AXIAL)
-
-
 def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[LayoutEntry, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
-    chosen = [FIELDS[name] for name in select_fields(names, config)]
-    return tuple(LayoutEntry(field.name, field.size(hand, config.orientation), field.scale) for field in chosen)
+    joints, vector, quat = (jnp.zeros(size) for size in (hand.num_joints, 3, 4))
+    past, taxels, command = jnp.stack([joints] * 2), jnp.zeros(hand.taxel_area.shape), jnp.zeros(())
+    readings = Readings(joints, joints, taxels, vector, vector, quat, quat, command, joints, past, vector)
+    parts = jax.eval_shape(lambda: _compute(hand, readings, names, config, Motion(joints, vector)))
+    fields = [FIELDS[name] for name in select_fields(names, config)]
+    return tuple(LayoutEntry(field.name, part.size, field.scale) for field, part in zip(fields, parts, strict=True))
 
 
 def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
@@ -246,10 +226,21 @@ def observe(
       [sum of the layout's sizes] float32, not normalised.
     """
     if hand.side == "left":
-        return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion and mirror_motion(motion))
-    if pose is None:
-        pose = forward_kinematics(hand, readings.joint_position)
+        motion = motion and Motion(motion.joint_velocity, motion.object_spin * AXIAL)
+        return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion)
+    return jnp.concatenate(_compute(hand, readings, names, config, motion, pose)).astype(jnp.float32)
+
+
+def _compute(
+    hand: Hand,
+    readings: Readings,
+    names: tuple[str, ...],
+    config: ObservationConfig,
+    motion: Motion | None,
+    pose: HandPose | None = None,
+) -> list[jax.Array]:
+    """The values of each field."""
+    pose = forward_kinematics(hand, readings.joint_position) if pose is None else pose
     contact = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(hand, readings, config, motion, pose, *contact)
-    parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
-    return jnp.concatenate(parts).astype(jnp.float32)
+    return [FIELDS[name].compute(features) for name in select_fields(names, config)]

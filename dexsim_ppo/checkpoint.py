@@ -47,11 +47,8 @@ def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], 
 
 
 def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
-    """Read and check a file of this kind, `"train"` or `"policy"`, and task; None takes any task.
-
-    Raises:
-      CheckpointError: missing, not of this format or version, cut short, altered, of another kind or of another task.
-    """
+    """Read and check a file of this kind, `"train"` or `"policy"`, and task; None takes any task. Raises
+    CheckpointError: missing, not of this format or version, cut short, altered, of another kind or of another task."""
     try:
         header, leaves = read_file(path, kind)
     except OSError as error:

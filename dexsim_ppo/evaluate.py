@@ -128,15 +128,12 @@ def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, 
         entered = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
         masked = {name: np.where(entered if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
         own = env.summarize(masked, alive)
-    share = mean_interval(alive[-1], start)
-    if starts == episodes:
-        wilson = statistics.proportion(alive[-1])
-        share = {"value": wilson["mean"], "low": wilson["low"], "high": wilson["high"]}
+    independent = starts == episodes
     return {
         "episodes": episodes,
         "steps": steps,
         "starts": starts,
-        "held": share | {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)},
+        "held": statistics.entry(statistics.proportion(alive[-1])) if independent else mean_interval(alive[-1], start),
         "return": mean_interval(last["return"], start),
         "steps_held": mean_interval(steps_held, start),
         "task": own,
@@ -144,13 +141,10 @@ def summarize(env: Any, metrics: dict[str, np.ndarray], terminated: np.ndarray, 
 
 
 def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
-    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
+    """Mean of samples [N] with a bootstrap 95 % interval, by start [N]: samples of one start are not independent."""
     _, which = np.unique(start, return_inverse=True)
-    mean, starts = float(np.mean(x)), int(which.max()) + 1
-    with np.errstate(invalid="ignore"):  # A return beyond float32 is infinite, its interval not a number.
-        off = np.bincount(which, np.asarray(x, float) - mean)
-    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
-    return {"value": mean, "low": mean - half, "high": mean + half}
+    entry = statistics.entry(statistics.ratio(np.bincount(which, x), np.bincount(which)))
+    return {name: np.nan if number is None else number for name, number in entry.items()}
 
 
 def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
@@ -237,7 +231,7 @@ def evaluate_policy(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluateArguments(Config):
-    """Options of `python -m dexsim_ppo.evaluate`."""
+    """Measure a policy over fixed, seeded episodes."""
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
@@ -288,12 +282,7 @@ def _measure(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    arguments = cli.parse(
-        EvaluateArguments,
-        argv,
-        prog="python -m dexsim_ppo.evaluate",
-        description="Measure a policy over fixed, seeded episodes.",
-    )
+    arguments = cli.parse(EvaluateArguments, argv)
     cli.enable_caches()
     video = arguments.video
     for path in (arguments.output, video):

@@ -193,7 +193,7 @@ def _card(policy: Policy, hand: Hand) -> str:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportArguments:
-    """Options of `python -m dexsim_ppo.export`."""
+    """Write a policy as an ONNX model, or as a bundle for a robot's computer."""
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
@@ -205,12 +205,7 @@ class ExportArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
-    arguments = cli.parse(
-        ExportArguments,
-        argv,
-        prog="python -m dexsim_ppo.export",
-        description="Write a policy as an ONNX model, or as a bundle for a robot's computer.",
-    )
+    arguments = cli.parse(ExportArguments, argv)
     if arguments.output is None and arguments.bundle is None:
         raise ConfigError("give --output FILE or --bundle FOLDER_OR_ZIP")
     policy = load_policy(arguments.policy)

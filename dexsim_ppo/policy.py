@@ -110,14 +110,11 @@ class Policy(Config):
         known = sorted(entry.name for entry in self.observation_layout)
         if unknown := sorted(set(names) - set(known)):
             raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(known)}")
-        keep = np.concatenate([np.full(entry.size, entry.name not in names) for entry in self.observation_layout])
-        # Normalised observations have mean 0 and come first: without its weights an input counts as its mean.
-        (first, *others), memory = self.params.layers, self.params.memory
-        first = _without_inputs(first, keep)
-        if memory is not None:
-            memory = dataclasses.replace(memory, input=_without_inputs(memory.input, keep))
-        params = dataclasses.replace(self.params, layers=(first, *others), memory=memory)
-        return dataclasses.replace(self, params=params)
+        out = np.concatenate([np.full(entry.size, entry.name in names) for entry in self.observation_layout])
+        # Normalised observations have mean 0: the largest deviation leaves nothing else.
+        std = jnp.where(out, np.finfo(np.float32).max, self.params.normalizer.std)
+        normalizer = dataclasses.replace(self.params.normalizer, std=std)
+        return dataclasses.replace(self, params=dataclasses.replace(self.params, normalizer=normalizer))
 
     def header(self) -> dict[str, Any]:
         """What its file says beside the numbers, as plain data."""
@@ -256,10 +253,3 @@ def _names(layers: int, memory: bool, clip: float) -> PolicyParams:
     unit = GRU(layer("input_"), layer("recurrent_")) if memory else None
     normalizer = Normalizer(cast(Any, "mean"), cast(Any, "std"), clip)
     return PolicyParams(tuple(layer("", f"_{i}") for i in range(layers)), normalizer, unit)
-
-
-def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
-    """A layer without the weights of those of its first inputs that are not to `keep` [n]."""
-    mask = np.ones(len(layer.kernel), np.float32)
-    mask[: keep.size] = keep
-    return dataclasses.replace(layer, kernel=layer.kernel * mask[:, None])

@@ -83,7 +83,7 @@ def draw_pictures(env: Any, snapshots: Snapshot) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordArguments(Config):
-    """Options of `python -m dexsim_ppo.record`."""
+    """Record simulated episodes of a policy for other programs."""
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
@@ -107,12 +107,7 @@ class RecordArguments(Config):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
-    arguments = cli.parse(
-        RecordArguments,
-        argv,
-        prog="python -m dexsim_ppo.record",
-        description="Record simulated episodes of a policy for other programs.",
-    )
+    arguments = cli.parse(RecordArguments, argv)
     if arguments.lerobot is None and arguments.rrd is None and arguments.npz is None:
         raise ConfigError("give --lerobot FOLDER, --rrd FILE or --npz FILE")
     policy = load_policy(arguments.policy, task=arguments.task)

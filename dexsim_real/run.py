@@ -483,11 +483,11 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     return objects
 
 
-def gravity_of(lean: Sequence[float], hand: Hand, nominal: Sequence[float]) -> np.ndarray:
-    """Gravity's direction [3] in the palm frame where `--lean` is measured; palm up or down as in the `nominal` one [3]."""
-    along, across = math.sin(lean[0]), -math.sin(lean[1])  # z is toward the fingers, y toward a right hand's thumb
+def gravity_of(lean: Sequence[float], hand: Hand, nominal: Sequence[float]) -> tuple[float, float, float]:
+    """Gravity in the palm frame from the measured `lean`; the palm is up or down as with the `nominal` gravity."""
+    along, across = math.sin(lean[0]), -math.sin(lean[1])  # z: to the fingers, y: to a right thumb
     out = math.copysign(math.sqrt(max(1.0 - along**2 - across**2, 0.0)), nominal[0])
-    return np.array([out, across if hand.side == "right" else -across, along])
+    return out, across if hand.side == "right" else -across, along
 
 
 # --- the status on the terminal ---------------------------------------------------------------------

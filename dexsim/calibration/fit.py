@@ -8,13 +8,17 @@ so intervals count whole presses, not samples.
 import dataclasses
 import datetime
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.ndimage import median_filter
+from scipy.optimize import least_squares
+from scipy.signal import find_peaks
+from scipy.special import stdtrit
+from scipy.stats import theilslopes
 
-from dexsim.calibration.line import LEAST_PRESSES, Line, fit_line
 from dexsim.calibration.maps import Calibration, Side, blank_calibration, check_plausible
-from dexsim.calibration.signals import check_signals, find_swings
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.description import Hand
 
@@ -24,6 +28,14 @@ MIN_FORCE_RANGE = 0.5
 """N between the 5th and the 95th percentile of the force."""
 _LOSSES = 0.3  # share by which a gear's losses may part the gains of the two directions
 _SATURATED = 0.2  # share of the samples that may be at the maximum
+_LARGEST = {"A": 20.0, "Nm": 50.0, "N": 500.0, "rad": 2 * np.pi}  # beyond these the unit must be another
+LEAST_PRESSES = 3
+"""Presses below which their differences are not part of an interval."""
+_CAUCHY = 2.385  # standard deviations, for 95 % efficiency under normal errors
+_OUTLIER = 5.0  # standard deviations
+_MAD = 1.4826  # median absolute deviation to standard deviation, normal errors
+_START = 300  # samples that the Theil-Sen line is drawn through, for all pairs of many take long
+_BLOCKS = (5, 20)  # parts of the samples by x, fewest and most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +48,17 @@ class JointPress:
     press: np.ndarray | None = None  # [T] int, number of the press, up and down; None: found
     gain_error: float = 0.0
     """Share of the gain, 95 %, that no sample can show: of the force's scale, or of the lever arm."""
+
+
+class Line(NamedTuple):
+    """The line y = gain x + offset; an error is half of a 95 % interval."""
+
+    gain: float
+    offset: float
+    gain_error: float
+    offset_error: float
+    r_squared: float  # share of the variance that the line explains, without outliers
+    inside: np.ndarray  # [T] bool, the samples that are no outliers
 
 
 def calibrate(
@@ -175,3 +198,118 @@ def _doubts(line: Line, which: str) -> list[str]:
         f"{which}: R2 {line.r_squared:.2f}: hardly a line": line.r_squared < 0.9,
     }
     return [note for note, doubtful in notes.items() if doubtful]
+
+
+# --- lines and signals ------------------------------------------------------------------------
+
+
+def fit_line(x: np.ndarray, y: np.ndarray, press: np.ndarray) -> Line:
+    """Fit y = gain x + offset to data with outliers.
+
+    A Cauchy M-estimate from the Theil-Sen line: outliers to one side hardly move it. The interval is a jackknife, which
+    leaves out a press, or a twentieth of the samples by x, at a time. The first shows what differs between presses, the
+    second what recurs in all of them (motor ripple) and noise that is correlated along x; the wider one counts.
+
+    Args:
+      x, y: [T], finite; T > 2 and x not constant.
+      press: [T] int, number of the press that a sample belongs to. From `LEAST_PRESSES` on, their differences widen the
+        intervals.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    scale = np.array([1.0, np.max(np.abs(x))])
+    design = np.stack([np.ones_like(x), x / scale[1]], -1)
+    some = np.random.default_rng(0).permutation(len(x))[:_START]
+    gain, offset, *_ = theilslopes(y[some], x[some])
+    noise = max(_MAD * float(np.median(np.abs(y - gain * x - offset))), 1e-9 * float(np.max(np.abs(y))), 1e-300)
+    fit = least_squares(
+        lambda guess: (design @ guess - y) / noise,
+        (offset, gain * scale[1]),
+        jac=lambda guess: design / noise,
+        loss="cauchy",
+        f_scale=_CAUCHY,
+        xtol=1e-12,
+    )
+    residual = y - design @ fit.x
+    square = (residual / (_CAUCHY * noise)) ** 2
+    weight = 1.0 / (1.0 + square)
+    slope = np.mean((1.0 - square) * weight**2)  # of the influence: how much a sample moves the line by itself
+    order, blocks = np.argsort(x, kind="stable"), int(np.clip(len(x) // 10, *_BLOCKS))
+    block = np.empty(len(x), int)
+    block[order] = np.arange(len(x)) * blocks // len(x)
+    groups = [block] + [press] * (len(np.unique(press)) >= LEAST_PRESSES)
+    error = np.max([jackknife(slope * design, design, weight * residual, group) for group in groups], 0)
+    (offset, gain), error = fit.x / scale, error / scale
+    explained = np.sum(weight * (y - np.average(y, weights=weight)) ** 2)
+    r_squared = float(1.0 - np.sum(weight * residual**2) / max(explained, 1e-300))
+    inside = np.abs(residual) <= _OUTLIER * noise
+    return Line(float(gain), float(offset), float(error[1]), float(error[0]), r_squared, inside)
+
+
+def jackknife(curvature: np.ndarray, design: np.ndarray, residual: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Half the 95 % interval [P] of a least-squares fit, from what it is without a group at a time: a Newton step each.
+
+    Args:
+      curvature: [N, P]; with the design it gives the Hessian, curvature^T design.
+      design: [N, P] derivatives of the model.
+      residual: [N], weighted.
+      group: [N] int, samples that belong together.
+    """
+    moved, whole = [], curvature.T @ design
+    for number in np.unique(group):
+        own = group == number
+        rest = np.linalg.pinv(whole - curvature[own].T @ design[own], rcond=1e-8, hermitian=True)
+        moved.append(rest @ (design[own].T @ residual[own]))
+    count = len(moved)
+    return stdtrit(count - 1, 0.975) * np.sqrt((count - 1) / count * np.sum(np.square(moved), 0))
+
+
+def check_signals(
+    where: str, least: int, signals: Mapping[str, tuple[np.ndarray, str]], saturated: float, top: float = 1 - 1e-9
+) -> None:
+    """Check the signals of one recording.
+
+    Args:
+      where: named in errors.
+      least: samples that are needed.
+      signals: array [T] and its unit, by name.
+      saturated: largest share of the samples that may be at the maximum; not of angles, which rest.
+      top: share of the maximum from which on a sample is at it.
+
+    Raises:
+      CalibrationError: too short, of different lengths, not numbers, another unit, or saturated.
+    """
+    shapes = {name: np.shape(array) for name, (array, _) in signals.items()}
+    length, *others = shapes.values()
+    if len(length) != 1 or length[0] < least or any(shape != length for shape in others):
+        got = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise CalibrationError(f"{where}: got {got}: expected arrays of one length, at least {least} samples")
+    for name, (array, unit) in signals.items():
+        size = np.abs(np.asarray(array, float))
+        if not np.isfinite(largest := size.max()):
+            raise CalibrationError(f"{where}: {name}: a sample is not a number; leave out the reads that failed")
+        if (typical := np.quantile(size, 0.75)) > _LARGEST[unit]:
+            raise CalibrationError(f"{where}: {name} of {typical:.3g} {unit}: give {unit}, not another unit or counts")
+        if unit != "rad" and np.mean(size >= top * largest) > saturated:
+            raise CalibrationError(
+                f"{where}: {name} stays at its maximum of {largest:.3g} {unit}: saturated; command or press less"
+            )
+
+
+def find_swings(force: np.ndarray, trim: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Direction and press of each sample of a force [T], in the order of time.
+
+    Returns:
+      Direction [T]: 1 while the force rises, -1 while it falls, 0 just after a turn: in the first `trim` of each swing
+      the gear's friction is on its way from one side to the other. Number [T] of the press, up and down again.
+    """
+    smooth = median_filter(np.asarray(force, float), 9 if len(force) >= 90 else 3, mode="nearest")
+    noise = 1.4826 * np.median(np.abs(np.diff(force) - np.median(np.diff(force)))) / np.sqrt(2)
+    step = max(0.05 * np.ptp(smooth), 4.0 * noise)
+    inner = [find_peaks(way * smooth, prominence=step)[0] for way in (1, -1)]
+    turns = np.concatenate([[0], np.sort(np.concatenate(inner)), [len(smooth) - 1]])
+    direction, press = np.zeros((2, len(smooth)), int)
+    for first, last in zip(turns[:-1], turns[1:], strict=True):
+        swing, reach = smooth[first:last] - smooth[first], smooth[last] - smooth[first]
+        direction[first:last] = np.where(np.abs(swing) >= trim * np.abs(reach), np.sign(reach), 0)
+        press[first:] += first > 0 and reach > 0
+    return direction, press

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.calibration.fit import JointPress
+from dexsim.calibration.fit import JointPress, find_swings
 from dexsim.calibration.maps import Calibration
-from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
 
 

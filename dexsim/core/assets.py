@@ -17,11 +17,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def asset_path(name: str) -> Path:
-    """Absolute path of an asset, from its name relative to `assets/`, such as `"hand/xhand_right.xml"`.
-
-    Raises:
-      AssetError: there is no such file or folder.
-    """
+    """Absolute path of an asset, from its name relative to `assets/`, such as `"hand/xhand_right.xml"`. Raises
+    AssetError: there is no such file or folder."""
     installed = _PACKAGE / "_assets"
     root = installed if installed.is_dir() else _PACKAGE.parent / "assets"
     if not (root / name).exists():

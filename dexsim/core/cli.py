@@ -53,8 +53,16 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
         sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
 
-def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: str, default: T | None = None) -> T:
+def parse(
+    cls: type[T],
+    argv: Sequence[str] | None,
+    *,
+    prog: str = "",
+    description: str | None = None,
+    default: T | None = None,
+) -> T:
     """Parse options into a dataclass with tyro, which handles `--help` and invalid values; None: this process's `argv`.
+    By default the command is the class's module, and described by the class's docstring.
 
     Raises:
       ConfigError: a value is out of range; names the option's class and field.
@@ -62,6 +70,9 @@ def parse(cls: type[T], argv: Sequence[str] | None, *, prog: str, description: s
     import tyro
 
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
+    if not prog:
+        module: Any = sys.modules[cls.__module__]  # by its own name where it is run as a command
+        prog = f"python -m {module.__spec__.name.removesuffix('.__main__')}"
     return tyro.cli(cls, args=argv, prog=prog, description=description, **kwargs)
 
 
@@ -108,11 +119,8 @@ def environment_report() -> dict[str, Any]:
 
 
 def check_writable(path: Path) -> None:
-    """Check, before long work, that a file can be written after it; make its folder.
-
-    Raises:
-      OSError: it cannot be written.
-    """
+    """Check, before long work, that a file can be written after it; make its folder. Raises OSError: it cannot be
+    written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -123,10 +131,7 @@ def check_writable(path: Path) -> None:
 
 def check_no_overwrite(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
     """Check that a command writes (files by option) neither a file that it reads (files by meaning) nor one file twice.
-
-    Raises:
-      ConfigError: it does.
-    """
+    Raises ConfigError: it does."""
     taken = {os.path.realpath(path): f"is the {what}" for what, path in inputs.items() if path and Path(path).is_file()}
     for option, path in outputs.items():
         if path and not is_device(path):

@@ -98,11 +98,8 @@ def to_dict(config: Any) -> Any:
 
 
 def from_dict(cls: type[T], data: dict[str, Any]) -> T:
-    """Rebuild a config dataclass from `to_dict`'s output; fields left out keep their default.
-
-    Raises:
-      ConfigError: an unknown field, or a value of the wrong type or out of range.
-    """
+    """Rebuild a config dataclass from `to_dict`'s output; fields left out keep their default. Raises ConfigError: an
+    unknown field, or a value of the wrong type or out of range."""
     if not isinstance(data, dict):
         raise ConfigError(f"{cls.__name__}: expected a table of fields, got {type(data).__name__}")
     fields = {field.name: field for field in dataclasses.fields(cls)}
@@ -126,11 +123,8 @@ def naming_file(path: object) -> typing.Iterator[None]:
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
     """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]": JSON, Python's
-    literals (which have .006 and 5.), or words without quotes. `from_dict` tells whether they fit.
-
-    Raises:
-      ConfigError: a setting without a name or a value.
-    """
+    literals (which have .006 and 5.), or words without quotes. `from_dict` tells whether they fit. Raises ConfigError:
+    a setting without a name or a value."""
     for entry in settings:
         path, _, text = entry.partition("=")
         if not (path and text):

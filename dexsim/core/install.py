@@ -17,11 +17,8 @@ def install_line(extra: str) -> str:
 
 
 def require(module: str, extra: str, purpose: str) -> None:
-    """Check that an optional package is installed, without importing it.
-
-    Raises:
-      DexsimError: it is not; says how to install the extra.
-    """
+    """Check that an optional package is installed, without importing it. Raises DexsimError: it is not; says how to
+    install the extra."""
     if find_spec(module) is None:
         raise DexsimError(f"{purpose} needs {module}: {install_line(extra)}")
 

@@ -27,7 +27,7 @@ from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.geometry import grid, rotations, surface_points
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics
 from dexsim.objects.config import ObjectConfig, load_mesh_object
@@ -322,10 +322,13 @@ def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams]
             raise ConfigError("touch_method = 'grid': needs ObjectConfig.mesh; or choose closed_form or surface_points")
         return lambda object: surface_points.from_shape(object.shape())
     mesh_object = load_mesh_object(config)
-    module: Any = grid if method == "grid" else surface_points
+    factor = lambda object: object.size[0, 0] / mesh_object.boxes.size[0, 0]  # noqa: E731
     with jax.ensure_compile_time_eval():
-        geometry = grid.bake(mesh_object.mesh) if method == "grid" else surface_points.from_mesh(mesh_object.mesh)
-    return lambda object: module.scaled(geometry, object.size[0, 0] / mesh_object.boxes.size[0, 0])
+        if method == "grid":  # its values stay shared under `vmap`
+            baked = grid.bake(mesh_object.mesh)
+            return lambda object: dataclasses.replace(baked, scale=factor(object))
+        points = surface_points.from_mesh(mesh_object.mesh)
+    return lambda object: dataclasses.replace(points, position=factor(object) * points.position)
 
 
 def _common_metrics(

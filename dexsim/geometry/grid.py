@@ -1,15 +1,13 @@
 """Signed-distance grids: baked once from any closed mesh, looked up by interpolation.
 
 Nodes hold the exact distance; where the surface is curved they are lowered by the mean overshoot of linear
-interpolation between the 8 nodes round a point. The normal is the analytic gradient of the interpolant, from the same
-reads. Beyond the grid the distance is that at the nearest point of its boundary plus the way there.
+interpolation between the 8 nodes round a point. Beyond the grid the distance is that at the nearest point of its
+boundary plus the way there.
 
 Shapes: n nodes along each axis. Units: m.
 """
 
 from __future__ import annotations
-
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -66,30 +64,13 @@ def from_distances(axes: list[np.ndarray], distance: np.ndarray) -> Grid:
     )
 
 
-def scaled(grid: Grid, scale: jax.Array | float) -> Grid:
-    """The object `scale` [] times as large; the values stay shared under `vmap`."""
-    return dataclasses.replace(grid, scale=jnp.asarray(scale, jnp.float32))
-
-
 def signed_distance(points: jax.Array, grid: Grid) -> jax.Array:
-    """Distance [...] m at points [..., 3] in the object's frame."""
-    return _look_up(points, grid)[0]
-
-
-def distance_and_normal(points: jax.Array, grid: Grid) -> tuple[jax.Array, jax.Array]:
-    """Distance [...] m and unit gradient [..., 3] of the interpolant."""
-    distance, gradient = _look_up(points, grid)
-    length = jnp.sqrt(sum(g * g for g in gradient) + _TINY)
-    return distance, jnp.stack([g / length for g in gradient], -1)
-
-
-def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]:
-    """Distance and its gradient's three components. Component by component, so that XLA makes one kernel of it."""
+    """Distance [...] m at points [..., 3] in the object's frame: by components, so that XLA makes one kernel of it."""
     n = grid.nodes
     step, start = grid.spacing * grid.scale, grid.origin * grid.scale
     # Without the barrier XLA would read and divide these few numbers anew for every point.
     step, rate, start = jax.lax.optimization_barrier((step, 1.0 / step, start))
-    gaps, cells, parts, free = [], [], [], []
+    gaps, cells, parts = [], [], []
     for axis in range(3):
         at = (points[..., axis] - start[axis]) * rate[axis]
         held = jnp.clip(at, 0.0, n - 1.0)
@@ -97,32 +78,17 @@ def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]
         gaps.append((at - held) * step[axis])
         cells.append(cell)
         parts.append(held - cell.astype(held.dtype))
-        free.append(at == held)
     # One aligned sector of 32 bytes, whose slices stay in the kernel that uses them. Read by one index, XLA (JAX 0.10)
     # writes every point's index to memory in a kernel of its own, by two it does not. No index is negative: without
     # saying so, each read costs a comparison, an addition and a choice more.
     at = cells[0], cells[1] * n + cells[2]
     row = grid.values.at[at].get(mode="promise_in_bounds", wrap_negative_indices=False)
-    value, slope = _linear([row[..., k] for k in range(8)], parts)
+    x, y, z = parts
+    corner = [row[..., k] for k in range(8)]  # z fastest
+    edge = [corner[k] + z * (corner[k + 1] - corner[k]) for k in (0, 2, 4, 6)]
+    face = [edge[k] + y * (edge[k + 1] - edge[k]) for k in (0, 2)]
     way = jnp.sqrt(sum(g * g for g in gaps) + _TINY)
-    unit = _MILLI * grid.scale
-    gradient = [
-        jnp.where(f, unit * s * rate[axis], 0.0) + gaps[axis] / way
-        for axis, (f, s) in enumerate(zip(free, slope, strict=True))
-    ]
-    return unit * value + way - _TINY**0.5, gradient
-
-
-def _linear(corners: list[jax.Array], parts: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
-    """Trilinear value, and its derivative by each part, from the corners in the order (x, y, z), z fastest."""
-    tx, ty, tz = parts
-    rise = [corners[k + 1] - corners[k] for k in (0, 2, 4, 6)]
-    edge = [corners[k] + tz * r for k, r in zip((0, 2, 4, 6), rise, strict=True)]
-    face = [edge[0] + ty * (edge[1] - edge[0]), edge[2] + ty * (edge[3] - edge[2])]
-    dx = face[1] - face[0]
-    dy = (1 - tx) * (edge[1] - edge[0]) + tx * (edge[3] - edge[2])
-    dz = (1 - tx) * (rise[0] + ty * (rise[1] - rise[0])) + tx * (rise[2] + ty * (rise[3] - rise[2]))
-    return face[0] + tx * dx, [dx, dy, dz]
+    return _MILLI * grid.scale * (face[0] + x * (face[1] - face[0])) + way - _TINY**0.5
 
 
 def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:

@@ -125,11 +125,8 @@ def signed_distance(mesh: Trimesh, points: np.ndarray) -> np.ndarray:
 
 
 def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
-    """Compare the volume where the distance is negative with what the mesh encloses, by random points.
-
-    Raises:
-      AssetError: they differ by more than a tenth and the error of sampling: the mesh cannot be signed.
-    """
+    """Compare the volume where the distance is negative with what the mesh encloses, by random points. Raises
+    AssetError: they differ by more than a tenth and the error of sampling: the mesh cannot be signed."""
     low, high = mesh.bounds
     distance = signed_distance(mesh, np.random.default_rng(0).uniform(low, high, (count, 3)))
     inside, enclosed = np.sum(distance < 0), count * mesh.volume / np.prod(high - low)

@@ -1,4 +1,4 @@
-"""Rotations: quaternions (w, x, y, z), matrices, 6-D rotation, angles.
+"""Rotations: quaternions (w, x, y, z), matrices, 6-D rotation, angles; and lengths of vectors.
 
 Products are written elementwise: XLA's default float32 matrix product on NVIDIA GPUs is TF32,
 which loses a tenth of a millimetre over the length of a finger.
@@ -90,3 +90,13 @@ def quat_angle(left: Array, right: Array) -> jax.Array:
 def matrix_to_6d(matrix: Array) -> jax.Array:
     """The first two columns of a rotation [..., 3, 3] as [..., 6] (Zhou et al. 2019)."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], -1)
+
+
+def length(vector: jax.Array) -> jax.Array:
+    """Euclidean length [...] of vectors [..., N], with gradient zero where a vector is exactly zero.
+
+    `jnp.linalg.norm` has the gradient NaN there, and the force on a finger that touches nothing is exactly zero.
+    """
+    square = jnp.sum(vector**2, axis=-1)
+    nonzero = square > 0
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1.0)), 0.0)

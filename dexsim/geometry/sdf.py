@@ -78,13 +78,6 @@ def to_local(points: Array, position: Array, rotation: Array) -> jax.Array:
     return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3)) for axis in range(3)], -1)
 
 
-def distance_and_normal(points: Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
-    """Distance [...] m and outward unit normal [..., 3] of the nearest surface, object frame."""
-    distance, pullback = jax.vjp(lambda p: signed_distance(p, shape), points)
-    (normal,) = pullback(jnp.ones_like(distance))
-    return distance, normal
-
-
 def _split(point: Array) -> tuple[Array, Array, Array]:
     return point[..., 0], point[..., 1], point[..., 2]
 

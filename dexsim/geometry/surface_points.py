@@ -8,7 +8,6 @@ Shapes: N points. Units: m.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
@@ -61,22 +60,12 @@ def from_shape(shape: sdf.Shape, count: int = COUNT) -> SurfacePoints:
     return SurfacePoints(jnp.concatenate(position), jnp.concatenate(normal))
 
 
-def scaled(surface: SurfacePoints, factor: jax.Array | float) -> SurfacePoints:
-    """The points of an object that is `factor` [] times as large."""
-    return dataclasses.replace(surface, position=factor * surface.position)
-
-
 def signed_distance(points: jax.Array, surface: SurfacePoints) -> jax.Array:
-    """Plane offset (p - p_o) . n_o [...] m at points [..., 3]."""
-    return distance_and_normal(points, surface)[0]
-
-
-def distance_and_normal(points: jax.Array, surface: SurfacePoints) -> tuple[jax.Array, jax.Array]:
-    """Plane offset [...] m and the nearest point's normal [..., 3]; the choice of point has no gradient."""
+    """Plane offset (p - p_o) . n_o [...] m at points [..., 3]; the choice of point has no gradient."""
     index = nearest(points, surface)
     position, normal = surface.position[index], surface.normal[index]
     parts = [(points[..., k] - position[..., k]) * normal[..., k] for k in range(3)]
-    return parts[0] + parts[1] + parts[2], normal
+    return parts[0] + parts[1] + parts[2]
 
 
 def nearest(points: jax.Array, surface: SurfacePoints) -> jax.Array:
@@ -124,7 +113,8 @@ def _template(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     shape = sdf.Shape((kind,), one, 0 * one, np.eye(3, dtype=np.float32)[None], np.ones(1, bool))
     with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
         points = rng.uniform(-1, 1, (60 * count, 3)).astype(np.float32) * [1, 1, 2 if kind == "capsule" else 1]
-        distance, normal = (np.asarray(x) for x in sdf.distance_and_normal(points, shape))
+        measure = jax.vmap(jax.value_and_grad(lambda point: sdf.signed_distance(point, shape)))
+        distance, normal = map(np.asarray, measure(points.astype(np.float32)))
         below = np.flatnonzero((distance > -_SKIN) & (distance < 0))
     points, normal = (points - distance[:, None] * normal)[below], normal[below]
     keep = _spread(points, count)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dexsim.core.errors import AssetError
+from dexsim.hand.fit import unit
 from dexsim.hand.vendor import Draft, Link
 
 _FLEXION = 0.7  # cosine to the axis of a finger's last joint above which another joint flexes, too
@@ -70,7 +71,7 @@ def tip_of(links: Sequence[Link], chain: Sequence[int]) -> np.ndarray:
     link's end."""
     link = links[chain[-1]]
     if link.surface is None:
-        return link.anchor + 0.02 * _unit(link.anchor - links[chain[0]].anchor + 1e-9)
+        return link.anchor + 0.02 * unit(link.anchor - links[chain[0]].anchor + 1e-9)
     points = np.asarray(link.surface.vertices)
     # The hinge may be anywhere on its axis.
     arms = points - link.anchor
@@ -133,14 +134,14 @@ def _find_frame(
     across, given = vectors[:, -1], along is not None or normal is not None
     if values[-1] < 0.8 * len(fingers) and (along is None or normal is None):
         raise AssetError("no palm side found, the fingers' last joints are not parallel: give --fingers and --normal")
-    arms = [_unit(tip_of(links, chain) - links[chain[0]].anchor) for chain in fingers]
-    z = _unit(np.mean(arms, 0) if along is None else np.asarray(along))
+    arms = [unit(tip_of(links, chain) - links[chain[0]].anchor) for chain in fingers]
+    z = unit(np.mean(arms, 0) if along is None else np.asarray(along))
     x = np.asarray(normal)
     if normal is None:
-        z = _unit(z - across * (across @ z))
+        z = unit(z - across * (across @ z))
         x = np.cross(across, z)
         x = x * np.sign(x @ sum(_bend(links, chain) for chain in fingers))
-    x = _unit(x - z * (z @ x))
+    x = unit(x - z * (z @ x))
     rotation = np.stack([x, np.cross(z, x), z])
     rounded = np.round(rotation)
     snaps = np.all(np.abs(rotation[rounded != 0]) > _SNAP) and np.linalg.det(rounded) == 1
@@ -169,7 +170,3 @@ def _close_positive(draft: Draft) -> list[str]:
         if sign < 0:
             link.low, link.high = -link.high, -link.low
     return sorted(wrong)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)

@@ -29,9 +29,6 @@ def write_hand(
 
     Args:
       grasp: entries of the TOML's `[grasp]`; None for none.
-
-    Raises:
-      OSError: a file cannot be written.
     """
     remarks = tuple(remarks)
     comment = "".join(f"  {line}\n" for line in remarks).replace("--", "- -")

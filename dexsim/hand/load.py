@@ -198,7 +198,7 @@ def _load(path: Path, source: str) -> Hand:
         body_names=tuple(model.body(b).name for b in bodies),
         body_parent=np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies]),
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
-        body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b]) for b in bodies]),
+        body_rotation=_f32([identity if b == palm else rotation_matrix(model.body_quat[b]) for b in bodies]),
         body_joint=np.array([joints.index(joint) if joint >= 0 else -1 for joint in body_motor], np.int32),
         body_ratio=_f32(body_ratio),
         body_offset=_f32(body_offset),
@@ -348,11 +348,12 @@ def _f32(values) -> np.ndarray:
     return np.asarray(values, np.float32)
 
 
-def _matrix(quat: np.ndarray) -> np.ndarray:
+def rotation_matrix(quat: Any) -> np.ndarray:
+    """[3, 3] of a quaternion (w, x, y, z)."""
     import mujoco
 
     matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quat)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
     return matrix.reshape(3, 3)
 
 
@@ -375,6 +376,6 @@ def _read_geoms(model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
             which = f"geom {model.geom(g).name or f'#{g}'!r} of {model.body(body).name!r}"
             raise ConfigError(f"{which} is no primitive and touches: meshes need contype and conaffinity 0")
         if kind is not None:
-            size, position, rotation = model.geom_size[g], model.geom_pos[g], _matrix(model.geom_quat[g])
+            size, position, rotation = model.geom_size[g], model.geom_pos[g], rotation_matrix(model.geom_quat[g])
             geoms.append(Geom(model.geom(g).name, kind, row[body], _f32(size), _f32(position), _f32(rotation), touches))
     return tuple(geoms)

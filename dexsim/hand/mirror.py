@@ -2,8 +2,10 @@
 
     dexsim import-hand my_right.toml --mirror --out my_left
 
-The palm's frame and every link's are reflected in their planes y = 0. Joint axes are axial vectors: the same angle
-turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are.
+The palm's frame and every link's are reflected in their planes y = 0. Positions, velocities and forces are polar
+vectors. Axes of rotation, angular velocities and torques are axial ones, which a reflection turns round in addition:
+the same angle turns a link the mirrored way, so joint angles, limits, torques and postures stay as they are. A body's
+orientation R becomes S R S, with S = diag(`POLAR`).
 """
 
 import dataclasses
@@ -20,10 +22,14 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
-from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand, read_mjcf
 
+POLAR = np.array([1.0, -1.0, 1.0], np.float32)
+AXIAL = -POLAR
+QUAT = np.array([1.0, -1.0, 1.0, -1.0], np.float32)
+"""Of (w, x, y, z): the angle stays, the axis is axial."""
+MATRIX = np.outer(POLAR, POLAR)
 OTHER = {"right": "left", "left": "right"}
 Point = TypeVar("Point", bound=tuple[float, ...])
 _SIGNS: dict[str, tuple[int, ...]] = {

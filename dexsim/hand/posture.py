@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 
 from dexsim.hand.description import Hand
-from dexsim.hand.fit import segment_distance
+from dexsim.hand.fit import segment_distance, unit
 from dexsim.hand.kinematics import finger_bodies, flexion_joints, open_hand
 from dexsim.hand.mjcf import hand_poses
 
@@ -49,9 +49,9 @@ def find_grasp(hand: Hand, gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     near = np.array([gaps[np.arange(len(row)), row, -1] for gaps, row in zip(clear, rows, strict=True)])[1:]
     holds = np.exp(-np.maximum(near - gap, 0) / _NEAR)
     below = np.clip((tips[..., 0] - height) / 0.02, -1, 1)  # tips carry from below the ball's middle
-    mean = _unit((_unit(tips - centres) * holds[..., None]).sum(0) + 1e-9)
+    mean = unit((unit(tips - centres) * holds[..., None]).sum(0) + 1e-9)
     tip = shapes[0][0][:, -1, 1]
-    score = np.clip((tip[:, 0] - height) / 0.02, -1, 1) - np.sum(_unit(tip - balls[:, 0]) * mean[:, None], -1)
+    score = np.clip((tip[:, 0] - height) / 0.02, -1, 1) - np.sum(unit(tip - balls[:, 0]) * mean[:, None], -1)
     score -= np.maximum(clear[0][..., -1] - gap, 0) / _NEAR + 10 * blocked[0]
     rows[0] = score.argmax(1)
     half_closed = -np.mean((_BENDS[rows[1:]] - _HALF) ** 2, 0)  # fingers must have way left to close
@@ -95,7 +95,3 @@ def _capsules(hand: Hand, finger: int, postures: np.ndarray) -> tuple[np.ndarray
             ends.append(position[:, None, body] + own @ rotation[:, body].swapaxes(-1, -2))
             radii.append(geom.size[0])
     return np.stack(ends, 1), np.array(radii)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)

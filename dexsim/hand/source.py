@@ -33,11 +33,7 @@ def _record(hand: Hand) -> Record:
 
 
 def check_same(record: Record | None, hand: Hand, what: str) -> None:
-    """Whether something recorded is of this hand.
-
-    Raises:
-      ConfigError: it is of another one; `what` names it.
-    """
+    """Whether something recorded is of this hand. Raises ConfigError: it is of another one; `what` names it."""
     before = record or _record(load_hand())
     if before["digest"] != hand.digest:
         changed = ": its files have changed since" if before["file"] == hand.source else ""

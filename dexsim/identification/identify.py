@@ -4,8 +4,8 @@ Output error: the joint is simulated from the commands alone (`dexsim.identifica
 moved until its readings are the log's.
 
 Inner loop of this search: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops
-without gradient: scans over latency (a whole number) and dead-band (a threshold), and a cross-entropy search, as a
-dead-band makes the cost rugged.
+without gradient: a scan over latency (a whole number), and a cross-entropy search, as a dead-band (a threshold) makes
+the cost rugged.
 """
 
 import dataclasses
@@ -16,11 +16,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from dexsim.calibration.line import LEAST_PRESSES
-from dexsim.calibration.signals import check_signals
+from dexsim.calibration.fit import LEAST_PRESSES, check_signals
 from dexsim.core.errors import CalibrationError
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
@@ -256,11 +255,8 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
 
 
 def check_log(log: JointLog) -> None:
-    """Refuse a log that cannot tell.
-
-    Raises:
-      CalibrationError: too short, not numbers, another unit, no motion, saturated throughout.
-    """
+    """Refuse a log that cannot tell. Raises CalibrationError: too short, not numbers, another unit, no motion,
+    saturated throughout."""
     channels = {"target": (log.target, "rad"), "position": (log.position, "rad")}
     if log.torque is not None:
         channels["torque"] = log.torque, "Nm"
@@ -367,7 +363,7 @@ class Search:
         inside = 0.05 * np.minimum(self.scale, self.high - self.low)
         self.theta = np.clip(begin, self.low + inside, self.high - inside)
         self.theta[-1] = begin[-1]
-        self.starts = self._rests = angle - float(self.fixed["encoder_bias"])
+        self.starts = angle - float(self.fixed["encoder_bias"])
         self.measured = np.stack([log.position] if log.torque is None else [log.position, log.torque])
         self.noise = np.array(_NOISE)[: len(self.measured)]
         self.timestep, self.latency, self.best = log.period / substeps, 0, np.inf
@@ -383,11 +379,9 @@ class Search:
     def run(self, latencies: tuple[int, ...]) -> None:
         """Fit once with the given weights, and once with those found."""
         self._scan_latencies(latencies)
-        for fine in (False, True):
-            if self.dead_band is not None:
-                self._search_dead_band(self.dead_band, fine)
+        for last in (False, True):
             self._scan_latencies(tuple(lag for lag in latencies if abs(lag - self.latency) <= 1))
-            self._settle(last=fine)
+            self._settle(last)
 
     # --- the inner loop ---------------------------------------------------------------------------
 
@@ -403,11 +397,9 @@ class Search:
         slope = np.concatenate([slope[..., self._index[:count]], own], -1)
         return slope.reshape(-1, slope.shape[-1])
 
-    def solve(
-        self, theta: np.ndarray, evaluations: int, with_band: bool = False
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Sum of squares, theta and starts of the fit by gradient; the dead-band stays unless asked."""
-        count, parts = len(theta) - (not with_band), len(self.starts)
+    def solve(self, theta: np.ndarray, evaluations: int, fixed: int = 0) -> tuple[float, np.ndarray, np.ndarray]:
+        """Sum of squares, theta and starts of the fit by gradient, without the last `fixed` of the parameters."""
+        count, parts = self.count - fixed, len(self.starts)
         scale = np.concatenate([self.scale[:count], np.full(parts, 0.01)])
         reach = 0.05  # rad that a start may be off the angle that was read
         low = np.concatenate([self.low[:count], self.starts - reach]) / scale
@@ -421,7 +413,6 @@ class Search:
             np.concatenate([theta[:count], self.starts]) / scale,
             jac=lambda x: self.jacobian(*split(x), count) * scale,
             bounds=(low, high),
-            method="trf",
             xtol=1e-6,
             ftol=1e-7,
             gtol=1e-10,
@@ -429,9 +420,9 @@ class Search:
         )
         return 2.0 * float(result.cost), *split(result.x)
 
-    def _attempt(self, theta: np.ndarray, evaluations: int, with_band: bool = False) -> float:
+    def _attempt(self, theta: np.ndarray, evaluations: int) -> float:
         """Sum of squares that is reached from here; keeps the solution if it is the best."""
-        cost, theta, starts = self.solve(theta, evaluations, with_band)
+        cost, theta, starts = self.solve(theta, evaluations)
         if cost < self.best:
             self.best, self.theta, self.starts = cost, theta, starts
         return cost
@@ -454,53 +445,17 @@ class Search:
             costs[self.latency] = self._attempt(self.theta, 6)
         self.latency = min(costs, key=costs.__getitem__)
 
-    def _search_dead_band(self, span: tuple[float, float], fine: bool) -> None:
-        """Scan the range, or five values about the present one, then Brent's method."""
-        cell = (span[1] - span[0]) / 10
-        near = np.clip(self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
-        grid = near if fine else np.linspace(*span, 11)
-        self.best = np.inf
-
-        def cost(width: float) -> float:
-            return self._attempt(np.append(self.theta[:-1], width), 5)
-
-        at = int(np.argmin([cost(width) for width in grid]))
-        minimize_scalar(
-            cost,
-            method="bounded",
-            bounds=(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]),
-            options={"xatol": 2e-3 * (span[1] - span[0])},
-        )
-
     def _settle(self, last: bool) -> None:
         """Solve to the end, and take each channel's noise from what the fit leaves."""
-        self.best, with_band = np.inf, self.dead_band is not None
+        self.best, rugged = np.inf, self.dead_band is not None
         self._attempt(self.theta, 30)
-        if with_band:
-            self._attempt(self.theta, 30, with_band=True)
-        # Without a dead-band there is next to nothing to get lost in.
-        self._start_over(tries=(6 if last else 10) if with_band else 2)
-        if with_band and not last:
+        if rugged and not last:
             self._explore(rounds=6)
         left = self.residual(self.theta, self.starts).reshape(self.measured.shape)
         self.noise = self.noise * np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
         if last:
             self.best = np.sum(self.residual(self.theta, self.starts) ** 2)
-            self._explore(rounds=14 if with_band else 3)
-
-    def _start_over(self, tries: int) -> None:
-        """Solve again from about the present parameters and from the angles as they were read: a valley to which both
-        have settled together has no other way out."""
-        rng, best, starts = np.random.default_rng(1), self.theta, self.starts
-        for index in range(tries):
-            width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
-            theta = best + width * self.scale * rng.standard_normal(len(best))
-            theta[self.count :] = best[self.count :]
-            self.starts = self._rests
-            result = self.solve(np.clip(theta, self.low, self.high), 12, self.dead_band is not None)
-            if result[0] < self.best:
-                self.best, best, starts = result
-        self.theta, self.starts = best, starts
+            self._explore(rounds=14 if rugged else 3)
 
     def _explore(self, rounds: int, crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
@@ -525,7 +480,7 @@ class Search:
             elite = tries[order[: crowd // 8]]
             middle, spread = elite[0], 2.0 * np.cov(elite.T) + 1e-12 * np.eye(count)
             before = self.best
-            self._attempt(thetas[order[0]], 6, self.dead_band is not None)
+            self._attempt(thetas[order[0]], 6)
             if self.best < before:
                 middle = self.theta[:count] / scale
 
@@ -544,12 +499,12 @@ class Search:
 
     def _profile_dead_band(self, span: tuple[float, float]) -> list[float]:
         """Where the sum of squares, fitted anew, rises by the critical value of a threshold."""
-        limit, ends = self._limit(self.solve(self.theta, 15)[0], True), list[float]()
+        limit, ends = self._limit(self.solve(self.theta, 15, fixed=1)[0], True), list[float]()
         for way, end in ((-1, span[0]), (1, span[1])):
             step, last = 2e-3 * (span[1] - span[0]), self.theta[-1]
             while way * (end - last) > 0:
                 tried = float(np.clip(last + way * step, *span))
-                if self.solve(np.append(self.theta[:-1], tried), 6)[0] > limit:
+                if self.solve(np.append(self.theta[:-1], tried), 6, fixed=1)[0] > limit:
                     break
                 last, step = tried, 1.6 * step
             ends.append(float(np.clip(last + way * step, *span)))  # the first that is excluded

@@ -150,11 +150,8 @@ def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarra
 
 
 def with_defaults(values: Mapping[str, float], log: JointLog) -> dict[str, jax.Array]:
-    """All parameters and the start, with nominal values for those left out.
-
-    Raises:
-      CalibrationError: a name that is no parameter, or a missing parameter without a nominal value.
-    """
+    """All parameters and the start, with nominal values for those left out. Raises CalibrationError: a name that is no
+    parameter, or a missing parameter without a nominal value."""
     full = {name: parameter.nominal for name, parameter in PARAMETERS.items()}
     full["start"] = float(log.position[0]) - values.get("encoder_bias", 0.0)
     if unknown := sorted(set(values) - set(full)):

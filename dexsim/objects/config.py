@@ -110,11 +110,7 @@ class ObjectConfig(Config):
 
 
 def load_mesh_object(config: ObjectConfig) -> MeshObject:
-    """The mesh of `config`, fitted.
-
-    Raises:
-      AssetError: see `dexsim.objects.mesh.load`.
-    """
+    """The mesh of `config`, fitted. Raises AssetError: see `dexsim.objects.mesh.load`."""
     file = Path(config.mesh).expanduser()
     changed = file.stat().st_mtime_ns if file.is_file() else 0
     unit, parts, repair = config.mesh_unit, config.mesh_parts, config.mesh_repair

@@ -96,11 +96,8 @@ class _Worlds:
         self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
 
     def tick(self, law: bytes, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step.
-
-        Raises:
-          RuntimeError: in a forked child, which has none of its parent's threads.
-        """
+        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step. Raises
+        RuntimeError: in a forked child, which has none of its parent's threads."""
         if self.process != os.getpid():
             raise RuntimeError(
                 "backend 'c' does not work in a forked process, which lacks its threads: "

@@ -79,11 +79,8 @@ def pair_constants(
 
 
 def thicken_tips(spec: mujoco.MjSpec, hand: Hand, thickness: float) -> None:
-    """Enlarge the geoms of the fingertips that touch by `thickness` m of rubber.
-
-    Raises:
-      AssetError: the size of one is not in the file, where rubber can be added to it.
-    """
+    """Enlarge the geoms of the fingertips that touch by `thickness` m of rubber. Raises AssetError: the size of one is
+    not in the file, where rubber can be added to it."""
     tips = {hand.body_names[b] for b in hand.tip_body}
     for geom in spec.geoms:
         if geom.parent.name in tips and (geom.contype or geom.conaffinity):

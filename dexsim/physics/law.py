@@ -100,11 +100,8 @@ class Recorded:
 
 
 def record(law: ImplicitLaw, joints: jax.Array) -> Recorded:
-    """Trace a law; of `joints` [J] only shape and type count.
-
-    Raises:
-      ConfigError: it has an operation that is not element by element, or arrays of another shape or type.
-    """
+    """Trace a law; of `joints` [J] only shape and type count. Raises ConfigError: it has an operation that is not
+    element by element, or arrays of another shape or type."""
     traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
     literals: list[list[Any]] = []
     steps: list[list[Any]] = []

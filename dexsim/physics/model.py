@@ -33,11 +33,8 @@ def build_scene(
     backend: str,
 ) -> PhysicsScene:
     """The scene for an engine: hand, free object, explicit pairs, force sensors, and the addresses of what changes in
-    the model.
-
-    Raises:
-      AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the object.
-    """
+    the model. Raises AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the
+    object."""
     check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), hand.model_path)
     spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     touching = _touching_geoms(hand, slots)
@@ -89,7 +86,8 @@ def build_scene(
         raise AssetError(f"{hand.model_path}: with the object in the scene: {' '.join(str(error).split())}") from None
     joints, free = [model.joint(name) for name in hand.joint_names], model.joint("object")
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
-    pairs, tips = contact.pairs_with(model, geoms), tip_bodies(model, hand)
+    pairs = contact.pairs_with(model, geoms)
+    tips = np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
     compliance, share, _ = contact.pair_constants(model, pairs, tips)
     model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(compliance, share * contact.NOMINAL, 2.0)
     rubber, growth = contact.rubber_geoms(model, pairs, tips)
@@ -109,11 +107,6 @@ def build_scene(
         tip_geoms=rubber,
         tip_growth=growth,
     )
-
-
-def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
-    """Body ids [F] of the fingertips."""
-    return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
 
 
 def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:

@@ -37,11 +37,8 @@ BACKENDS: dict[str, Callable[[PhysicsScene], Backend]] = {"c": CBackend, "cuda":
 
 
 def choose_backend(backend: str) -> str:
-    """The name of a backend. `auto`: c on a CPU, cuda on an NVIDIA GPU, else mjx.
-
-    Raises:
-      ConfigError: no such backend, or its device is missing.
-    """
+    """The name of a backend. `auto`: c on a CPU, cuda on an NVIDIA GPU, else mjx. Raises ConfigError: no such backend,
+    or its device is missing."""
     if backend not in ("auto", *BACKENDS):
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
     device = jax.default_backend()

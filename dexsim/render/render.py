@@ -17,9 +17,8 @@ from dexsim.core.files import write_atomic
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import Pose, hand_poses
-from dexsim.render.camera import Camera
 from dexsim.render.panel import draw_panel, read_outs, taxel_image
-from dexsim.render.picture import draw_scene
+from dexsim.render.picture import Camera, draw_scene
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {

@@ -150,14 +150,9 @@ class TaxelArray:
 def neighbour_difference(force: jax.Array, grid: tuple[int, int]) -> jax.Array:
     """Sum over a taxel's lattice neighbours of their force less its own [F, N]; sums to zero over a finger."""
     map_ = force.reshape(*force.shape[:-1], *grid)
-    total = jnp.zeros_like(map_)
-    for axis in (-2, -1):
-        step = jnp.diff(map_, axis=axis)
-        ahead = [(0, 0)] * map_.ndim
-        behind = [(0, 0)] * map_.ndim
-        ahead[axis], behind[axis] = (0, 1), (1, 0)
-        total = total + jnp.pad(step, ahead) - jnp.pad(step, behind)
-    return total.reshape(force.shape)
+    wide = jnp.pad(map_, [(0, 0)] * (map_.ndim - 2) + [(1, 1)] * 2, mode="edge")
+    around = wide[..., :-2, 1:-1] + wide[..., 2:, 1:-1] + wide[..., 1:-1, :-2] + wide[..., 1:-1, 2:]
+    return (around - 4 * map_).reshape(force.shape)
 
 
 def _uniform(key: jax.Array, span: Range, shape: tuple[int, ...]) -> jax.Array:

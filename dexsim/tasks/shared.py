@@ -31,11 +31,8 @@ def close_fingers(hand: Hand, fingers: range) -> np.ndarray:
 
 def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array, rotation: jax.Array) -> jax.Array:
     """Smallest distance [] m from the object to what touches of the hand: its spheres, its capsules at seven points of
-    each, and the boxes of all links but the palm at 125 points of each.
-
-    Raises:
-      AssetError: the hand has none of them.
-    """
+    each, and the boxes of all links but the palm at 125 points of each. Raises AssetError: the hand has none of
+    them."""
     pose, palm = forward_kinematics(hand, joints), hand.body_names.index(hand.palm)
     round_ = [g for g in hand.geoms if g.touches and g.kind in ("capsule", "sphere")]
     boxes = [g for g in hand.geoms if g.touches and g.kind == "box" and g.body != palm]

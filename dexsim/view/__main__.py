@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewArguments(Config):
-    """Options of `python -m dexsim.view`."""
+    """Show a hand live in the browser."""
 
     what: Annotated[str, tyro.conf.Positional] = "grasp"
     """Policy file, name of a shipped policy or of a task (my_module:poke for one of your own), log file (.log) of a run
@@ -80,13 +80,8 @@ def open_source(arguments: ViewArguments) -> "Source":
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command: serves the page until Ctrl-C. Returns its exit code, 0.
-
-    Raises:
-      DexsimError: it needs JAX, which is missing; see `open_source`.
-    """
-    description = "Show a hand live in the browser."
-    arguments = cli.parse(ViewArguments, argv, prog="python -m dexsim.view", description=description)
+    """The command: serves the page until Ctrl-C. Returns its exit code, 0."""
+    arguments = cli.parse(ViewArguments, argv)
     recorded = asset_path("episodes") / f"{arguments.what}.npz"
     if recorded.is_file() and not find_spec("jax"):
         arguments = dataclasses.replace(arguments, what=str(recorded))

@@ -19,11 +19,8 @@ from dexsim_real.wire.driver import check_wire
 
 
 class Emulation:
-    """Trials of a policy (a file, or a shipped one's name) on the emulated hand, one an episode.
-
-    Raises:
-      HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.
-    """
+    """Trials of a policy (a file, or a shipped one's name) on the emulated hand, one an episode. Raises HandError: the
+    emulated hand has no such task or mount, or the policy observes what no sensor measures."""
 
     def __init__(self, name: str, seed: int = 0, hand: str = ""):
         prepare_jax()

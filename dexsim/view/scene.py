@@ -12,9 +12,8 @@ import trimesh
 
 from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.hand.mjcf import Pose, hand_poses
-from dexsim.render.camera import look
 from dexsim.render.panel import force_color
-from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color
+from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, look
 from dexsim.render.render import camera_of
 from dexsim.render.snapshot import Snapshot
 

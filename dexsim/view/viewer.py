@@ -51,11 +51,8 @@ def clicked(button: Any) -> bool:
 
 
 class Viewer:
-    """A source in the browser, on a page that is served at a host and port.
-
-    Raises:
-      DexsimError: `host` is no address of this computer.
-    """
+    """A source in the browser, on a page that is served at a host and port. Raises DexsimError: `host` is no address of
+    this computer."""
 
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
         import viser

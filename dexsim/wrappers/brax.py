@@ -123,25 +123,19 @@ class BraxEnv(Env):
         return dataclasses.replace(typed, key=key)
 
 
-class TimeLimit(EpisodeWrapper):
-    """brax's episode bookkeeping, ending episodes at the task's own time limit as well."""
-
-    def step(self, state: State, action: jax.Array) -> State:
-        state = super().step(state, action)
-        terminated = state.done * (1 - state.info["truncation"])
-        truncation = jnp.maximum(state.info["truncation"], state.info["time_limit"] * (1 - terminated))
-        done = jnp.maximum(state.done, truncation)
-        return state.replace(done=done, info={**state.info, "truncation": truncation, "episode_done": done})
-
-
-class Restart(Wrapper):
-    """Starts finished episodes anew from the task's distribution of start states."""
+class Episodes(EpisodeWrapper):
+    """brax's episode bookkeeping, which ends episodes at the task's own time limit as well, and starts new ones from
+    the task's distribution of start states."""
 
     def step(self, state: State, action: jax.Array) -> State:
         steps = jnp.where(state.done, 0, state.info["steps"])
         state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
-        state = self.env.step(state, action)
-        return jax.vmap(self.unwrapped.restart)(state, state.done)
+        state = super().step(state, action)
+        terminated = state.done * (1 - state.info["truncation"])
+        truncation = jnp.maximum(state.info["truncation"], state.info["time_limit"] * (1 - terminated))
+        done = jnp.maximum(state.done, truncation)
+        state = state.replace(done=done, info={**state.info, "truncation": truncation, "episode_done": done})
+        return jax.vmap(self.unwrapped.restart)(state, done)
 
 
 def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
@@ -153,7 +147,7 @@ def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomizatio
     """
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: the task draws its own parameters; set its `randomization` config instead")
-    return Restart(TimeLimit(VmapWrapper(env), episode_length, action_repeat))
+    return Episodes(VmapWrapper(env), episode_length, action_repeat)
 
 
 def _is_key(leaf: Any) -> bool:
@@ -165,6 +159,4 @@ def _raw(leaf: jax.Array) -> jax.Array:
 
 
 def _typed(template: Any, leaf: jax.Array) -> jax.Array:
-    if not _is_key(template):
-        return leaf
-    return jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(jax.random.key(0)))
+    return jax.random.wrap_key_data(leaf) if _is_key(template) else leaf

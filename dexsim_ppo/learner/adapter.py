@@ -136,10 +136,6 @@ class Adapted:
 
 
 def adapt(env: Any, name: str = "") -> Environment:
-    """`env` itself if it is an `Environment`, else a wrapper of a `SimpleEnvironment`; its name is that of its class
-    by default.
-
-    Raises:
-      ConfigError: a member is missing.
-    """
+    """`env` itself if it is an `Environment`, else a wrapper of a `SimpleEnvironment`; its name is that of its class by
+    default. Raises ConfigError: a member is missing."""
     return env if hasattr(env, "observation_layout") else Adapted(env, name or type(env).__name__)

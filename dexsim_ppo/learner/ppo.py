@@ -23,7 +23,7 @@ from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
 from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
-from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments, value_std
+from dexsim_ppo.learner.running_stats import init_stats, merge_moments, value_std
 from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
 from dexsim_ppo.learner.types import Environment, TrainState
 from dexsim_ppo.learner.update import Learner, init_adam, update
@@ -126,12 +126,12 @@ def train_iteration(
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
-    batch = prepare(config, state, rollout, mesh)
-    learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
-    learner, update_metrics = update(config, normalizers, batch.samples, update_key, learner, mesh)
+    samples, state, explained = prepare(config, state, rollout, mesh)
+    learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
+    learner, update_metrics = update(config, normalizers, samples, update_key, learner, mesh)
     metrics |= update_metrics | {
         "bounded_rewards": bounded,
-        "explained_variance": batch.explained_variance,
+        "explained_variance": explained,
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate,
         "skipped_updates": learner.skipped_updates,
@@ -141,19 +141,15 @@ def train_iteration(
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
         env_state = jax.vmap(cast(Any, env).set_randomization_scale, (0, None))(env_state, scale)
-    return TrainState(
-        params=learner.params,
+    return dataclasses.replace(
+        state,
         average=average_weights(state.average, learner.params, state.iteration),
-        adam=learner.adam,
-        learning_rate=learner.learning_rate,
-        observation_stats=batch.observation_stats,
-        value_stats=batch.value_stats,
         env_state=env_state,
         key=key,
         iteration=state.iteration + 1,
-        skipped_updates=learner.skipped_updates,
         scale=scale,
         carry=carry,
+        **learner._asdict(),
     ), metrics
 
 
@@ -166,11 +162,7 @@ def average_weights(average: tuple, params: Params, iteration: jax.Array) -> tup
 
 def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
     """The next scale [] of the curriculum, in [0, 1], and the success [] of this iteration. A NaN success (no episode
-    has ended) leaves the scale unchanged.
-
-    Raises:
-      ConfigError: the curriculum names a metric that does not exist.
-    """
+    has ended) leaves the scale unchanged. Raises ConfigError: the curriculum names a metric that does not exist."""
     if not curriculum.metric:
         success = 1 - metrics["terminated_share"]
     elif curriculum.metric in metrics:
@@ -185,19 +177,12 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
 # --- advantages ---------------------------------------------------------------------------------------
 
 
-class TrainingBatch(NamedTuple):
-    """What is learnt from, and the statistics that include it."""
-
-    samples: Samples
-    params: Params  # their critic's output in the units of `value_stats`
-    value_stats: RunningStats
-    observation_stats: dict[str, RunningStats]
-    explained_variance: jax.Array  # [] share of the returns' variance that the critic's values explain
-
-
-def prepare(config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh | None = None) -> TrainingBatch:
-    """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
-    the statistics."""
+def prepare(
+    config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh | None = None
+) -> tuple[Samples, TrainState, jax.Array]:
+    """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; the
+    state with statistics that include them, and a critic whose output is in the units of `value_stats`; and the share
+    [] of the returns' variance that the critic's values explain."""
     advantage, target = compute_gae(config, rollout)
     observations = {group: rollout.obs[group] for group in state.observation_stats}
     values = {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}
@@ -227,7 +212,8 @@ def prepare(config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh |
     samples = in_blocks(samples, blocks, sequences=rollout.carry is not None)
     explained = 1 - variances["error"] / variances["target"]
     params = dataclasses.replace(state.params, critic=critic)
-    return TrainingBatch(samples, params, value_stats, observation_stats, explained)
+    state = dataclasses.replace(state, params=params, value_stats=value_stats, observation_stats=observation_stats)
+    return samples, state, explained
 
 
 def compute_gae(config: PPOConfig, rollout: Rollout) -> tuple[jax.Array, jax.Array]:

@@ -32,10 +32,8 @@ Tree = TypeVar("Tree")
 
 def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
     """So many devices of all processes together, 0 for all; None for one device of one process, which needs no mesh.
-
-    Raises:
-      ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by them.
-    """
+    Raises ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by
+    them."""
     available = jax.devices()
     count = devices or len(available)
     if count > len(available) or (jax.process_count() > 1 and count < len(available)):

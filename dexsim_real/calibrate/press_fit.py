@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
-from dexsim.calibration.line import fit_line
+from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate, fit_line
 from dexsim.calibration.maps import Calibration
 from dexsim.calibration.press import MIN_LEVER, contact_jacobian
 from dexsim.core.errors import CalibrationError

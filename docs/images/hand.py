@@ -16,9 +16,8 @@ import dexsim
 from dexsim.control import commanded_force
 from dexsim.hand.description import Hand
 from dexsim.hand.mjcf import hand_poses
-from dexsim.render.camera import look
 from dexsim.render.panel import ACCENT, EMPTY, FAINT, INK, PANEL, force_color, taxel_image
-from dexsim.render.picture import draw_scene, goal_position
+from dexsim.render.picture import draw_scene, goal_position, look
 from dexsim.render.render import CAMERAS
 from dexsim.render.snapshot import Snapshot
 from dexsim_ppo import load_policy

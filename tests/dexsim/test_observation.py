@@ -17,7 +17,6 @@ from dexsim.observation import (
     GRASP,
     ROTATE,
     LayoutEntry,
-    Motion,
     ObservationConfig,
     ObservationField,
     Readings,
@@ -142,20 +141,10 @@ def test_every_reading_matters(hand, readings):
         ), field.name
 
 
-@pytest.mark.parametrize("orientation", ["6d", "quaternion"])
-def test_every_field_has_the_size_that_it_says(hand, readings, orientation):
-    config = ObservationConfig(orientation=orientation)
-    motion = Motion(np.ones(12, np.float32), np.ones(3, np.float32))
-    for name in FIELDS:
-        values = jax.eval_shape(lambda name=name: observation.observe(hand, readings, (name,), config, motion))
-        assert [entry.size for entry in layout(hand, (name,), config)] == list(values.shape), name
-
-
 def test_a_field_of_ones_own_is_one_entry(hand, readings, monkeypatch):
     """Named in the configuration, it stands at the observation's end, and the bridge knows who measures it."""
     own = ObservationField(
         name="bending",
-        size=lambda hand, encoding: 1,
         source="hand",
         compute=lambda f: f.readings.joint_position.sum()[None],
         scale=12.0,

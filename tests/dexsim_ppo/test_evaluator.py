@@ -84,11 +84,11 @@ def test_a_film_shows_the_lowest_and_the_highest_command_to_half_a_second_after_
 def test_intervals_are_by_start():
     """Copies of an episode add nothing: four starts sixteen times each are four samples."""
     entry = mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
-    assert entry["value"] == 2.5 and entry["high"] - 2.5 == pytest.approx(1.96 * np.sqrt(5 / 3) / 2)
+    assert entry["value"] == 2.5 and 1 < entry["low"] < 2 and 3 < entry["high"] < 4
     values, start = np.tile([1.0, 2, 3, 4], 16), np.tile(np.arange(4), 16)
     assert mean_interval(values, start) == pytest.approx(entry)
-    uneven = mean_interval(np.array([0.0, 0.0, 0.0, 1.0]), np.array([7, 7, 7, 9]))  # sums of starts: -3/4 and 3/4
-    assert uneven["high"] - 0.25 == pytest.approx(1.96 * np.sqrt(2 * 2 * 0.75**2) / 4)
+    uneven = mean_interval(np.array([0.0, 0.0, 0.0, 1.0]), np.array([7, 7, 7, 9]))
+    assert uneven == {"value": 0.25, "low": 0.0, "high": 1.0}  # either start may be drawn twice
     terminated = np.tile(np.array([True, False, False, False]), 16)[None]
     report = summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
     assert report["starts"] == 4 and report["held"]["value"] == 0.75

@@ -16,8 +16,8 @@ from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
-from dexsim.geometry.mirror import POLAR, QUAT
 from dexsim.hand.load import load_hand
+from dexsim.hand.mirror import POLAR, QUAT
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS, find_task, make_task
 from dexsim.task_spec import TaskSpec

@@ -22,7 +22,7 @@ from dexsim.core.ranges import uniforms
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.params import ObjectParams, extent

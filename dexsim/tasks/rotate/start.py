@@ -6,18 +6,18 @@ configuration.
 """
 
 import dataclasses
-import functools
 import json
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
 
 from dexsim.core.assets import cached_arrays
+from dexsim.core.compilation import available_cores
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import Array
@@ -29,7 +29,8 @@ from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.config import INACTIVE_SIZE, SHAPES, load_mesh_object
 from dexsim.objects.params import ObjectParams, extent, sample_object, unit_inertia
 from dexsim.physics import contact
-from dexsim.physics.model import build_scene, tip_bodies
+from dexsim.physics.interface import PhysicsScene
+from dexsim.physics.model import build_scene
 from dexsim.tasks.shared import clearance, close_fingers, palm_height
 
 CLEARANCE = 0.001  # m, smallest gap between palm and object with support "fingers"
@@ -111,11 +112,8 @@ def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Arra
 
 
 def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
-    """The pool of start states, from disk if it has been made before.
-
-    Raises:
-      ConfigError: next to nothing stays in the hand.
-    """
+    """The pool of start states, from disk if it has been made before. Raises ConfigError: next to nothing stays in the
+    hand."""
     structure = jax.tree.structure(jax.eval_shape(lambda: sample_turned_object(key, config)))
 
     def make() -> dict[str, np.ndarray]:
@@ -152,29 +150,27 @@ def _make(
     Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
     where whatever stays is kept they are all but left out.
     """
-    chunk, threads = 1024, min(os.cpu_count() or 1, 16)
+    chunk = 1024
     object_key, key = jax.random.split(key)
     draw = jax.jit(jax.vmap(lambda k: sample_turned_object(k, config)))
     objects = jax.device_get(draw(jax.random.split(object_key, size)))
     candidate = _trap_candidate if trap else _candidate
     sample = jax.jit(jax.vmap(lambda k, object: candidate(k, object, hand, config)))
     starts, waiting, tried = {}, np.arange(size), 0
-    with ThreadPoolExecutor(threads) as pool:
-        models = [_model(hand, config, gravity) for _ in range(threads)]
-        for trial in range(_TRIALS):
-            which = np.resize(waiting, chunk)
-            keys = jax.random.split(jax.random.fold_in(key, trial), chunk)
-            candidates = jax.device_get(sample(keys, jax.tree.map(lambda leaf, which=which: leaf[which], objects)))
-            rows = np.flatnonzero(candidates["clear"])
-            rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
-            settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates, trap=trap)
-            settled = list(pool.map(settle, models, [rows[i::threads] for i in range(threads)]))
-            good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
-            for k in _clear_of_palm(hand, config, candidates["object"], good, qpos):
-                starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
-            waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
-            if not len(waiting) or tried > 1000 and len(starts) < tried / (2000 if trap else 200):
-                break
+    scene = _scene(hand, config, gravity)
+    batch = Batch(scene.model, chunk, available_cores())
+    for trial in range(_TRIALS):
+        which = np.resize(waiting, chunk)
+        keys = jax.random.split(jax.random.fold_in(key, trial), chunk)
+        candidates = jax.device_get(sample(keys, jax.tree.map(lambda leaf, which=which: leaf[which], objects)))
+        rows = np.flatnonzero(candidates["clear"])
+        rows = np.sort(rows[np.unique(which[rows], return_index=True)[1]])  # one posture for each object
+        good, qpos = _settle(batch, scene, config, candidates, rows, trap)
+        for k in _clear_of_palm(hand, config, candidates["object"], good, qpos):
+            starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
+        waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
+        if not len(waiting) or tried > 1000 and len(starts) < tried / (2000 if trap else 200):
+            break
     if len(starts) < (1 if trap else 0.9 * size):
         raise ConfigError(
             f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
@@ -244,47 +240,40 @@ def _at(
     }
 
 
-def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
+def _scene(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> PhysicsScene:
     """The scene in C, with springs at the joints for the motors."""
-    model = build_scene(hand, config.objects.slots, largest_size(config), config.physics, gravity, "mjx").model
-    dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
-    model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
+    scene = build_scene(hand, config.objects.slots, largest_size(config), config.physics, gravity, "mjx")
+    model, dofs = scene.model, scene.joint_dof
+    model.jnt_stiffness[model.dof_jntid[dofs]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping
     model.opt.timestep = 0.005  # s; the springs are explicit here, unlike the motors of an environment
     # C MuJoCo takes shortcuts for frames that coincided when it compiled; sizes change here.
     model.geom_sameframe[:] = model.body_sameframe[:] = 0
-    return model
+    return scene
 
 
 def _settle(
-    model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any], trap: bool
+    batch: Batch, scene: PhysicsScene, config: Any, candidates: dict[str, Any], rows: np.ndarray, trap: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that came to rest where they belong, and their qpos."""
-    data, object = mujoco.MjData(model), candidates["object"]
-    geoms = [model.geom(f"object_{k}").id for k in range(len(object.kinds))]
-    body = model.body("object").id
-    springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
-    pairs = contact.pairs_with(model, np.array(geoms))
-    rubber = contact.pair_constants(model, pairs, tip_bodies(model, hand))[2] >= 0
-    ticks = max(round(_SETTLING / model.opt.timestep), 1)
-    good, settled = [], []
-    for row in rows:
-        model.geom_size[geoms] = object.size[row]
-        model.geom_pos[geoms] = object.position[row]
-        if object.quat is not None:
-            model.geom_quat[geoms] = object.quat[row]
-        model.body_mass[body], model.body_inertia[body] = object.mass[row], object.inertia[row]
-        model.body_ipos[body] = object.com[row]
-        slide = np.where(rubber, object.friction[row], object.link_friction[row])
-        model.pair_friction[pairs, :2] = slide[:, None]
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] = candidates["qpos"][row]
-        model.qpos_spring[springs] = candidates["joint_target"][row]
-        mujoco.mj_step(model, data, ticks)
-        if _stays(model, config, data, trap):
-            good.append(row)
-            settled.append(data.qpos.astype(np.float32))
-    return np.array(good, int), np.reshape(np.array(settled, np.float32), (len(settled), model.nq))
+    """Those of `rows` that came to rest where they belong, and their qpos; of one world each."""
+    object, body, at = candidates["object"], scene.object_body, rows[:, None]
+    batch.expand("geom_size")[at, scene.object_geoms] = object.size[rows]
+    batch.expand("geom_pos")[at, scene.object_geoms] = object.position[rows]
+    if object.quat is not None:
+        batch.expand("geom_quat")[at, scene.object_geoms] = object.quat[rows]
+    for name, values in (("mass", object.mass), ("inertia", object.inertia), ("ipos", object.com)):
+        batch.expand(f"body_{name}")[rows, body] = values[rows]
+    rubber = contact.pair_constants(scene.model, scene.object_pairs, scene.tip_bodies)[2] >= 0
+    slide = np.where(rubber, object.friction[at], object.link_friction[at])
+    batch.expand("pair_friction")[at, scene.object_pairs, :2] = slide[..., None]
+    batch.expand("qpos_spring")[at, scene.joint_qpos] = candidates["joint_target"][rows]
+    batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+    batch.bind("qpos")[rows], batch.warning[:] = candidates["qpos"][rows], 0
+    batch.step(rows, max(round(_SETTLING / scene.model.opt.timestep), 1))
+    qpos, qvel = batch.bind("qpos")[rows], batch.bind("qvel")[rows]
+    sound = np.isfinite(qpos).all(1) & ~batch.warning[rows, :, 1].any(1)
+    stays = sound & _stays(config, qpos[:, scene.object_qpos], qvel[:, scene.object_dof], trap)
+    return rows[stays], qpos[stays].astype(np.float32)
 
 
 def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
@@ -295,20 +284,14 @@ def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarr
     return np.flatnonzero(np.asarray(low) > palm_height(hand) + CLEARANCE)
 
 
-def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData, trap: bool) -> bool:
-    free = model.joint("object")
-    place = data.qpos[free.qposadr[0] :][:7]
-    motion = data.qvel[free.dofadr[0] :][:6]
-    turned = np.empty(3)
-    mujoco.mju_rotVecQuat(turned, config.turn.unit_axis, place[3:])
-    rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
-    sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
-    away = np.linalg.norm(place[:3] - config.reference)
-    if trap:
-        pitch = np.arctan2(-turned[2], turned[0])
-        ahead = place[2] - config.reference[2] > _TRAP_PLACE
-        inside = ahead and _TRAP_PITCH[0] < pitch < _TRAP_PITCH[1] and away < config.drop_radius
-    else:
-        tilt = np.arccos(np.clip(turned @ config.turn.unit_axis, -1.0, 1.0))
-        inside = tilt < _LEVEL and away < 0.6 * config.turn.distance
-    return bool(inside and rest and sound)
+def _stays(config: Any, place: np.ndarray, motion: np.ndarray, trap: bool) -> np.ndarray:
+    """Whether objects at [N, 7], with these velocities [N, 6], are at rest where they belong [N]."""
+    axis = config.turn.unit_axis
+    turned = Rotation.from_quat(place[:, 3:], scalar_first=True).apply(axis)
+    rest = (np.linalg.norm(motion[:, :3], axis=1) < _AT_REST[0]) & (np.linalg.norm(motion[:, 3:], axis=1) < _AT_REST[1])
+    away = np.linalg.norm(place[:, :3] - config.reference, axis=1)
+    if not trap:
+        tilt = np.arccos(np.clip(turned @ axis, -1.0, 1.0))
+        return rest & (tilt < _LEVEL) & (away < 0.6 * config.turn.distance)
+    pitch, ahead = np.arctan2(-turned[:, 2], turned[:, 0]), place[:, 2] - config.reference[2] > _TRAP_PLACE
+    return rest & ahead & (_TRAP_PITCH[0] < pitch) & (pitch < _TRAP_PITCH[1]) & (away < config.drop_radius)

@@ -19,7 +19,7 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects import params
@@ -171,7 +171,8 @@ class Rotate(Task):
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
     def update(self, key: jax.Array | None, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
-        now, period, touching = self.progress(goal, truth), self._period, self._touching(truth)
+        now, period = self.progress(goal, truth), self._period
+        touching = (length(truth.finger_force) > TOUCH).astype(jnp.float32)
         clock = goal.clock + period
         change = {
             "spin": now.spin,
@@ -258,9 +259,6 @@ class Rotate(Task):
         own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), self._axis)
         across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
         return jnp.arctan2(across, jnp.sum(own * self._axis))
-
-    def _touching(self, truth: GroundTruth) -> jax.Array:
-        return (length(truth.finger_force) > TOUCH).astype(jnp.float32)
 
     # --- evaluation ------------------------------------------------------------------------
 

@@ -14,8 +14,7 @@ import scipy.stats
 from hypothesis import given, settings, strategies as st
 from virtual_press import Motor, press, varied_presses
 
-from dexsim.calibration.fit import JointPress, calibrate, fit_joint
-from dexsim.calibration.line import fit_line
+from dexsim.calibration.fit import JointPress, calibrate, find_swings, fit_joint, fit_line
 from dexsim.calibration.maps import (
     Side,
     blank_calibration,
@@ -27,7 +26,6 @@ from dexsim.calibration.maps import (
     taxel_force,
 )
 from dexsim.calibration.press import lever_arms
-from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
 
 # --- lines -----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.compilation import jit
-from dexsim.geometry.vectors import length
+from dexsim.geometry.rotations import length
 from dexsim.objects.config import ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig
 

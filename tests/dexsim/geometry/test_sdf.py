@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dexsim.geometry import sdf
+from dexsim.geometry.distance import distance_and_normal as measure
 
 EYE = np.eye(3, dtype=np.float32)
 SIZES = {
@@ -68,7 +69,7 @@ def random_rotation(rng):
 
 
 distance = jax.jit(sdf.signed_distance)
-distance_and_normal = jax.jit(sdf.distance_and_normal)
+distance_and_normal = jax.jit(measure)
 
 
 # --- single primitives ---------------------------------------------------------------------------

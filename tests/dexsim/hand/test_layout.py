@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from shapes import solid
 
 from dexsim.core.errors import ConfigError
-from dexsim.geometry import sdf
+from dexsim.geometry.distance import distance_and_normal
 from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
 from dexsim.hand.load import load_hand
 
@@ -34,7 +34,7 @@ def test_taxels_lie_on_their_surface_wherever_it_is(straight):
     position, normal = taxels[:, :3], taxels[:, 3:6]
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-12)
     above = position + 1e-5 * normal
-    distance, away = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), solid("capsule", 0.012, straight))
+    distance, away = distance_and_normal(jnp.asarray(above, jnp.float32), solid("capsule", 0.012, straight))
     np.testing.assert_allclose(distance, 1e-5, atol=1e-8)
     np.testing.assert_allclose(away, normal, atol=1e-5)
     # Rows keep their pitch in arc length everywhere, columns in the middle.

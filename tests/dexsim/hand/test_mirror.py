@@ -15,12 +15,21 @@ from dexsim import import_hand
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.geometry import rotations
-from dexsim.geometry.mirror import AXIAL, MATRIX, POLAR, QUAT
 from dexsim.hand import mirror
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import find_hand, load_hand
-from dexsim.hand.mirror import is_mirror_image, mirror_hand, mirror_mjcf, swap_sides, write_mirror
+from dexsim.hand.mirror import (
+    AXIAL,
+    MATRIX,
+    POLAR,
+    QUAT,
+    is_mirror_image,
+    mirror_hand,
+    mirror_mjcf,
+    swap_sides,
+    write_mirror,
+)
 from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, mirror_readings, observe
 
 HANDS = ("xhand_right", "leap_like", "inspire_like")

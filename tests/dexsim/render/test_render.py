@@ -15,8 +15,7 @@ from dexsim.core.assets import asset_path
 from dexsim.datasets.episodes import read_episodes
 from dexsim.geometry import sdf
 from dexsim.render import picture, render
-from dexsim.render.camera import Camera, look
-from dexsim.render.picture import Primitives, cast
+from dexsim.render.picture import Camera, Primitives, cast, look
 
 KINDS = ("sphere", "box", "cylinder", "capsule")
 SIZES = {
@@ -164,7 +163,7 @@ def test_rendering_needs_no_opengl_and_no_pyplot():
 import sys
 import numpy as np
 import dexsim.render.render
-from dexsim.render.camera import Camera, look
+from dexsim.render.picture import Camera, look
 from dexsim.render.picture import Primitives, cast
 assert not {"matplotlib", "PIL"} & set(sys.modules)
 ball = Primitives(("sphere",), np.full((1, 3), 0.1), np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 6, 3)))

@@ -6,7 +6,6 @@ environment plays back a script, so all but the sampled actions is known beforeh
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.loss import loss
 from dexsim_ppo.learner.networks import init_params
 from dexsim_ppo.learner.running_stats import RunningStats
+from dexsim_ppo.learner.types import TrainState
 
 STEPS, ROWS, ACTIONS = 8, 5, 2
 CONFIG = dataclasses.replace(
@@ -98,17 +98,19 @@ def experience(script, config, params, stats, value_stats, key):
 
     @jax.jit
     def run(step):
-        state = SimpleNamespace(
+        state = TrainState(
             params=params,
             value_stats=value_stats,
             env_state=jax.vmap(lambda row: script.at(row, 0))(jnp.arange(ROWS)),
             carry=None,
             observation_stats=stats,
             key=key,
+            **dict.fromkeys(("average", "adam", "learning_rate", "iteration", "skipped_updates")),
         )
         normalizers = ppo.make_normalizers(script, config, stats)
         _, rollout, _ = ppo.collect_rollout(script, config, state)
-        samples, start, *_ = ppo.prepare(config, state, rollout)
+        samples, state, _ = ppo.prepare(config, state, rollout)
+        start = state.params
         moved = jax.tree.map(jnp.add, start, step)
         objective = lambda p: loss(p, config, normalizers, samples, params.log_std)  # noqa: E731
         (value, metrics), grads = jax.value_and_grad(objective, has_aux=True)(moved)

@@ -76,7 +76,8 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
     @jax.jit
     def collect(state):
         (after, _), rollout, metrics = ppo.collect_rollout(env, config, state)
-        batch = ppo.prepare(config, state, rollout)
+        samples, learnt, explained = ppo.prepare(config, state, rollout)
+        batch = samples, learnt.params, learnt.value_stats, learnt.observation_stats, explained
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         return after.key, rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
 
