@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
-from dexsim.core.errors import DexsimError
 from dexsim_real import replay
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.run import __main__ as run
@@ -147,25 +146,3 @@ def without_frames(folder):
             assert replay.main([str(path)]) == 1
         line = out.getvalue().splitlines()[-1]
         assert line.startswith(f"nothing could be compared{says}"), line
-
-
-def test_a_log_of_another_command_is_named_with_the_command_that_reads_it(tmp_path):
-    with LogWriter(tmp_path / "other.log") as log:
-        log.add(Kind.META, {"task": "calibrate", "calibration": "", "hardware": {}})
-    with pytest.raises(LogError, match="not a log of a run; `python -m dexsim_real.calibrate "):
-        replay.main([str(log.path)])
-
-
-def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "Replay", lambda *_: pytest.fail("the replay began"))
-    log = str(tmp_path / "run.log")
-    (tmp_path / "taken.png").mkdir()
-    for option in ("--plot", "--rrd", "--output"):
-        with pytest.raises(IsADirectoryError, match="taken.png"):
-            replay.main([log, option, str(tmp_path / "taken.png")])
-    (tmp_path / "run.log").touch()
-    with pytest.raises(DexsimError, match="--output .*run.log: is the log; name another file"):
-        replay.main([log, "--output", log])
-    pytest.importorskip("pyarrow")
-    with pytest.raises(DexsimError, match="taken.png: exists already"):
-        replay.main([log, "--lerobot", str(tmp_path / "taken.png")])
