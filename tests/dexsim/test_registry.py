@@ -78,13 +78,3 @@ def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand)
     asked = []
     monkeypatch.setattr(registry.importlib.metadata, "entry_points", lambda *, group: asked.append(group) or [Point()])
     assert registry.find_task("mine").task is Mine and asked == ["dexsim.tasks"]
-
-
-def test_what_make_refuses():
-    for name, options, message in (
-        ("juggle", {}, "unknown task 'juggle': choose from grasp, .*rotate.*--task my_module:juggle"),
-        ("rotate", {"config": GraspConfig()}, "takes a RotateConfig, not a GraspConfig"),
-        ("os:grasp", {}, "'grasp' is a task of dexsim"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            dexsim.make(name, options.pop("config", None), **options)

@@ -6,7 +6,6 @@ import re
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 import scipy.signal
@@ -19,14 +18,12 @@ from dexsim.calibration.line import fit_line
 from dexsim.calibration.maps import (
     Side,
     blank_calibration,
-    calibrated_hand,
     joint_torque,
     load_calibration,
     normalised_torque,
     save_calibration,
     taxel_force,
 )
-from dexsim.calibration.press import lever_arms
 from dexsim.calibration.signals import find_swings
 from dexsim.core.errors import CalibrationError
 
@@ -155,13 +152,6 @@ def test_a_hand_that_counts_backwards(hand, fitted):
     np.testing.assert_allclose(joint_torque(other, -current), joint_torque(calibration, current), rtol=1e-4)
 
 
-def test_taxel_counts_become_newtons(fitted):
-    calibration = dataclasses.replace(fitted[0], force_per_count=np.array([0.1, 0.2, 0.1, 0.1, 0.3]))
-    counts = np.arange(5)[:, None] + np.array([[-7, 0, 10]])
-    expected = np.maximum(counts * calibration.force_per_count[:, None], 0)
-    np.testing.assert_allclose(taxel_force(calibration, counts), expected, rtol=1e-6)
-
-
 def test_joints_without_a_recording_take_their_class(hand):
     some = ("thumb_bend", "thumb_rota2", "index_joint1", "index_joint2")
     calibration, *_ = calibrated(hand, names=some)
@@ -259,13 +249,6 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         refused(path, hand)
 
 
-def test_a_missing_file_or_folder_is_one_line(hand, fitted, tmp_path):
-    with pytest.raises(CalibrationError, match="none.toml: cannot be read"):
-        load_calibration(tmp_path / "none.toml", hand)
-    with pytest.raises(CalibrationError, match="/proc/none/c.toml: cannot be written"):
-        save_calibration("/proc/none/c.toml", fitted[0])
-
-
 # --- what no hand gives -----------------------------------------------------------------------
 
 
@@ -349,15 +332,6 @@ def test_a_damaged_file_is_refused(hand, sound, tmp_path, old, new, says):
     assert re.search(says, refused(path, hand))
 
 
-def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
-    save_calibration(tmp_path / "c.toml", sound)
-    calibration = load_calibration(tmp_path / "c.toml", hand)
-    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
-    expected = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
-    np.testing.assert_allclose(calibrated_hand(hand, calibration).force_per_torque, expected)
-    assert calibrated_hand(hand, blank_calibration(hand)) is hand is calibrated_hand(hand, None)  # Nothing was pressed.
-
-
 NUMBERS = st.one_of(st.floats(), st.floats(-3, 3), st.sampled_from([0.0, 1e-9, 1e9]))
 PAIRS = st.one_of(NUMBERS, st.lists(NUMBERS, min_size=2, max_size=2))
 LINES = st.sampled_from(["real.gain", "real.offset", "sim.gain", "sim.offset"])
@@ -380,26 +354,3 @@ def test_a_forged_file_is_refused_or_gives_torques_and_forces_of_a_hand(hand, so
     stalled = np.asarray(normalised_torque(calibration, np.full(12, 1.5, np.float32)))
     assert np.all(np.abs(idle) < 1.01) and np.all(np.abs(stalled) < 60)
     assert np.all(np.asarray(taxel_force(calibration, np.full((5, 1), 255.0, np.float32))) <= 255.0)
-
-
-# --- the simulation's side --------------------------------------------------------------------------
-
-
-def test_lever_arms_are_c_mujocos(hand):
-    """J^T n at a taxel, from mj_jac at the same point of the tip's body."""
-    rng = np.random.default_rng(6)
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    data = mujoco.MjData(model)
-    for finger in range(5):
-        angle = rng.uniform(hand.joint_lower, hand.joint_upper)
-        taxel = int(rng.integers(hand.num_taxels))
-        data.qpos[[model.joint(name).qposadr[0] for name in hand.joint_names]] = angle
-        mujoco.mj_forward(model, data)
-        body = model.body(hand.body_names[hand.tip_body[finger]]).id
-        turn = data.xmat[body].reshape(3, 3)
-        point = data.xpos[body] + turn @ hand.taxel_position[finger, taxel]
-        jacobian = np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jacobian, None, point, body)
-        torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
-        expected = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
-        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), expected, atol=2e-6)
