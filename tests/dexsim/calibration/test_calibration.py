@@ -18,6 +18,7 @@ from dexsim.calibration.line import fit_line
 from dexsim.calibration.maps import (
     Side,
     blank_calibration,
+    calibrated_hand,
     joint_torque,
     load_calibration,
     normalised_torque,
@@ -150,6 +151,13 @@ def test_a_hand_that_counts_backwards(hand, fitted):
     other = calibrate(hand, turned, sim)
     current = jnp.linspace(0.05, 0.6, 12)
     np.testing.assert_allclose(joint_torque(other, -current), joint_torque(calibration, current), rtol=1e-4)
+
+
+def test_taxel_counts_become_newtons(fitted):
+    calibration = dataclasses.replace(fitted[0], force_per_count=np.array([0.1, 0.2, 0.1, 0.1, 0.3]))
+    counts = np.arange(5)[:, None] + np.array([[-7, 0, 10]])
+    expected = np.maximum(counts * calibration.force_per_count[:, None], 0)
+    np.testing.assert_allclose(taxel_force(calibration, counts), expected, rtol=1e-6)
 
 
 def test_joints_without_a_recording_take_their_class(hand):
@@ -330,6 +338,15 @@ def test_a_damaged_file_is_refused(hand, sound, tmp_path, old, new, says):
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
     assert re.search(says, refused(path, hand))
+
+
+def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
+    save_calibration(tmp_path / "c.toml", sound)
+    calibration = load_calibration(tmp_path / "c.toml", hand)
+    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
+    expected = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
+    np.testing.assert_allclose(calibrated_hand(hand, calibration).force_per_torque, expected)
+    assert calibrated_hand(hand, blank_calibration(hand)) is hand is calibrated_hand(hand, None)  # Nothing was pressed.
 
 
 NUMBERS = st.one_of(st.floats(), st.floats(-3, 3), st.sampled_from([0.0, 1e-9, 1e9]))
