@@ -59,9 +59,10 @@ def test_what_a_task_lacks_is_named(hand, what):
     assert "\n" not in str(error.value)
 
 
-def test_a_module_is_named_with_the_task(hand):
-    assert registry.find_task("poke_task:poke").config().gain == 3.0
-    assert registry.make_task("poke", hand).name == "poke"
+def test_a_module_is_named_with_the_task(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "poke_task.py").write_text("import dexsim, test_registry\ndexsim.register('poke', test_registry.Mine)")
+    assert registry.find_task("poke_task:poke").task.__name__ == "Mine"
     with pytest.raises(ConfigError, match="task module 'no_such_module': cannot be imported"):
         registry.find_task("no_such_module:poke")
     with pytest.raises(ConfigError, match="unknown task 'prod': choose from grasp, grasp_paper, poke, rotate"):

@@ -24,7 +24,7 @@ from dexsim.tasks.rotate import start
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, any_object, clear_of_palm, paper
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import lowest_point, sample_turned_object, solid_inertia, upright
-from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate, goal_quat
+from dexsim.tasks.rotate.task import WORKING_DUTY, Rotate
 from dexsim.tasks.shared import palm_height
 from dexsim.touch.taxel_force import Touch
 
@@ -83,13 +83,6 @@ def rules(rules_of) -> Rules:
 
 
 class TestGoal:
-    @pytest.mark.parametrize("turns", [0, 1, 2, 3, 4, 1000])
-    def test_each_goal_is_a_quarter_turn_further(self, turns):
-        found = goal_quat(jnp.int32(turns), jnp.array([1.0, 0, 0]), math.pi / 2)
-        expected = Rotation.from_rotvec([math.pi / 2 * ((turns + 1) % 4), 0, 0])
-        got = Rotation.from_quat(np.roll(found, -1))
-        assert (got.inv() * expected).magnitude() < 1e-3
-
     def test_posture_and_reference_are_the_hands_unless_given(self, hand):
         of_hand, given = Rotate(RotateConfig(), hand), Rotate(clear_of_palm(), hand)
         assert of_hand.reference == of_hand.config.reference == hand.rotate_reference == (0.047, 0.024, 0.088)
