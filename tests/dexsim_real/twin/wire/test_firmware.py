@@ -1,6 +1,7 @@
 """The emulated palm board: answers, quantisation, protection."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +10,13 @@ pytest.importorskip("serial")
 from twin_pair import command
 from twin_plant import ScriptedPlant
 
+from dexsim.hand.load import load_hand
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.wire.firmware import OVERHEATED, Firmware
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, check_identity, read_identity
 
 
 def ask(board, kind, data=b"", target=0x80):
@@ -75,3 +79,14 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]
+
+
+def test_each_hand_tells_its_side_and_is_refused_with_the_model_of_the_other(hand):
+    left = load_hand("xhand_left")
+    for one, other in ((hand, left), (left, hand)):
+        board = Firmware(SimpleNamespace(hand=one))
+        registers = (register.to_bytes(2, "little") for register in (SERIAL_NUMBER, SIDE))
+        told = read_identity(*(ask(board, Command.READ_REGISTER, name).data[2:] for name in registers))
+        assert check_identity(told, one) == []
+        with pytest.raises(HandError, match=f"this is a {one.side} hand .* the model a {other.side} one: see --hand"):
+            check_identity(told, other)
