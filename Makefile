@@ -37,7 +37,7 @@ train: $(INSTALLED)
 	$(PY) -m dexsim_ppo.train --task grasp $(ARGS)
 
 test: $(TESTABLE)
-	$(PY) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(ARGS)
+	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 mutants: $(MUTABLE)
 	$(PY) benchmarks/mutants.py $(ARGS)

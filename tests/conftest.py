@@ -72,31 +72,21 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 hypothesis.settings.register_profile("dexsim", deadline=None, max_examples=20, derandomize=True)
 hypothesis.settings.load_profile("dexsim")
 
-# Files of one group run in one of the suite's processes, which makes what they share once.
-GROUPS = {
-    "grasp": "shipped_policy env grasp control cuda_backend c_backend contact randomization ground_truth "
-    "view gymnasium",
-    "learner": "learning iteration train fine_tune evaluator policy_files runlog",
-    "presses": "press_fit procedure calibrate_command",
-}
-GROUP_OF = {f"test_{file}": name for name, files in GROUPS.items() for file in files.split()}
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
 LONGEST = """
-grasp test_hand_tasks learner presses test_shipped_policies test_import_hand test_docs test_engines test_bridge_run
-test_motors_off test_true_angles test_notebook test_check_hand test_identification test_tactile test_rotate
+test_hand_tasks test_shipped_policy test_identification test_docs test_engines test_check_hand test_press_fit
+test_procedure test_import_hand test_identify_drives test_env test_shipped_policies test_gymnasium test_learning
+test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_train
+test_true_angles test_c_backend test_randomization
 """.split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first; skip what is marked `gpu` where there is none."""
     place = {name: index for index, name in enumerate(LONGEST)}
-    group_of = lambda item: GROUP_OF.get(item.path.stem, item.path.stem)  # noqa: E731
-    items.sort(key=lambda item: place.get(group_of(item), len(LONGEST)))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(group_of(item)))
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
     if any("gpu" in item.keywords for item in items) and jax.default_backend() != "gpu":
         skip = pytest.mark.skip(reason="needs a GPU and DEXSIM_TEST_GPU=1")
         for item in items:
