@@ -126,13 +126,13 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
     hand, grasp_env, grasp_rollout
 ):
     """The environment's readings, given to the controller with the user's command, lead to the same corrections of the
-    command by the force loop."""
+    command by the force loop; in both the action of a reading is the one that led to it."""
     pytest.importorskip("serial")
     from dexsim_real.control.controller import Controller
     from dexsim_real.sensors.camera import ObjectEstimate
     from dexsim_real.sensors.hand import HandMeasurement
 
-    env = grasp_env
+    env, rng = grasp_env, np.random.default_rng(0)
 
     class Close:
         task, spec, control_rate = env.name, env.spec, 1 / env.control_period
@@ -142,13 +142,14 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
             return None
 
         def act(self, carry, observation):
-            return carry, np.full(12, 0.2, np.float32)
+            return carry, rng.uniform(-0.3, 0.7, 12).astype(np.float32)
 
     state, first = grasp_rollout.reset(jax.random.key(3)), Controller(Close(), hand)
     controllers = [copy.copy(first) for _ in range(4)]  # which share what is compiled
     for index, controller in enumerate(controllers):
         controller.start(np.asarray(state.joint_target[index]))
     shown, wanted, nothing, sent, targets = [], [], np.zeros(1), [], []
+    actions = np.zeros((8, 12), np.float32)
     for _ in range(40):
         readings, true = jax.device_get((state.readings, state.physics.qpos[:, env.physics.joint_qpos]))
         for index, controller in enumerate(controllers):
@@ -160,10 +161,14 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
             seen = ObjectEstimate(row.object_position, row.object_velocity, row.object_quat)
             command = float(state.goal.command[index])
             tick = controller.tick(measured, seen, row.goal_quat, command)
+            np.testing.assert_array_equal(tick.readings.last_action, actions[index])
+            for name in ("last_action", "past_actions"):
+                np.testing.assert_allclose(getattr(tick.readings, name), getattr(row, name), atol=1e-6)
             shown.append(float(tick.readings.command))
             wanted.append(float(row.command))
             sent.append(tick.target)
-        state = grasp_rollout.step(state, jnp.full((8, 12), 0.2))
+            actions[index] = tick.action
+        state = grasp_rollout.step(state, jnp.asarray(actions))
         targets += list(np.asarray(state.joint_target)[: len(controllers)])
     np.testing.assert_allclose(shown, wanted, atol=1e-6)
     np.testing.assert_allclose(sent, targets, atol=1e-5)

@@ -18,7 +18,7 @@ TIMES = dict(timestep=0.005, control_period=0.03)
 def draws(hand, config):
     """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
     keys = jax.random.split(jax.random.key(0), 1000)
-    return jax.vmap(lambda key: sample_hand(key, config, hand, **TIMES))(keys)
+    return jax.device_get(jax.vmap(lambda key: sample_hand(key, config, hand, **TIMES))(keys))
 
 
 def quantities(hand, drawn):

@@ -144,13 +144,6 @@ def without_ticks(folder):
     assert out.getvalue().splitlines()[-1] == "nothing could be compared"
 
 
-def test_a_log_of_another_command_is_named_with_the_command_that_reads_it(tmp_path):
-    with LogWriter(tmp_path / "other.log") as log:
-        log.add(Kind.META, {"task": "calibrate", "calibration": "", "hardware": {}})
-    with pytest.raises(LogError, match="not a log of a run; `python -m dexsim_real.calibrate "):
-        replay.main([str(log.path)])
-
-
 def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
     monkeypatch.setattr(replay, "Replay", lambda *_: pytest.fail("the replay began"))
     log = str(tmp_path / "run.log")

@@ -4,6 +4,7 @@ import sys
 import time
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 import rclpy_stand_in
@@ -71,7 +72,7 @@ def test_joint_states_wrenches_and_taxels_are_those_of_the_hand(make, leap):
     assert [(dim.label, dim.size, dim.stride) for dim in array.layout.dim] == [("finger", 4, 192), ("taxel", 48, 48)]
     np.testing.assert_allclose(np.reshape(array.data, (4, 48)), driver.state.taxel_force, rtol=1e-5)
     # Against the palm frame's taxels: the same force and torque, turned into the frame of the tip's body.
-    pose = forward_kinematics(leap, hand.safety.sample.measured.joint_position)
+    pose = jax.jit(forward_kinematics, static_argnums=0)(leap, hand.safety.sample.measured.joint_position)
     force = -1.5 * np.array(taxel_normals(leap, pose))[1, 5:9]
     lever = np.array(taxel_positions(leap, pose))[1, 5:9] - np.array(pose.body_position)[leap.tip_body[1]]
     turned = np.array(pose.body_rotation)[leap.tip_body[1]]

@@ -5,9 +5,7 @@ inertia (C MuJoCo ignores geom offsets that are set on a compiled model whose ge
 body's origin), only its active primitives exist, and forces are summed from `mj_contactForce`.
 """
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -181,7 +179,7 @@ def rows_of(pool, shape: str) -> np.ndarray:
 
 def stack(trees):
     """A batch of such rows."""
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def squeeze(hand, begun, rng: np.random.Generator, steps=100):
@@ -203,15 +201,3 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
     model.opt.gravity[:] = GRAVITY
     single = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
     return model, *single, np.float32(torque * rng.uniform(0.5, 1.2, 12))
-
-
-@contextlib.contextmanager
-def double_precision() -> Iterator[None]:
-    """64-bit JAX, where the library's 32-bit constants may be promoted.
-
-    Traces that JAX keeps from 32-bit code clash with it, and the other way round.
-    """
-    jax.clear_caches()
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        yield
-    jax.clear_caches()

@@ -13,6 +13,9 @@ from dexsim.hand.kinematics import forward_kinematics
 from dexsim.physics.interface import StepResult
 from dexsim.touch.taxel_force import Touch
 
+# Of the rotation task's pools, which are kept on disk: another size is settled anew.
+POOL_SIZE = 32
+
 
 def with_episode(state, **parts):
     """`state` with other parts of what its episode drew: `hand`, `object`, `imu`, `taxels`."""

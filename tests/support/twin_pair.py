@@ -1,10 +1,7 @@
-"""An emulated hand for tests: on a cable in memory in virtual time; in a thread."""
-
-import threading
+"""An emulated hand for tests, on a cable in memory in virtual time."""
 
 from twin_plant import REST, ScriptedPlant
 
-from dexsim_real.twin.__main__ import Twin, TwinArguments
 from dexsim_real.twin.wire import Firmware, HandLine
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
@@ -53,21 +50,3 @@ class Cable:
                 pieces.append((self.now, bytes(self.to_host)))
                 self.to_host.clear()
         return pieces
-
-
-class Running:
-    """A twin that runs in a thread."""
-
-    def __init__(self, folder, **options):
-        self.twin = Twin(TwinArguments(**options), ScriptedPlant(), folder, lambda text: None)
-        self.port = str(self.twin.line.terminal.name)
-        self._thread = threading.Thread(target=self.twin.run, daemon=True)
-        self._thread.start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.twin.stop()
-        self._thread.join()
-        self.twin.close()

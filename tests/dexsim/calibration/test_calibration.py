@@ -6,7 +6,6 @@ import re
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 import scipy.signal
@@ -25,7 +24,6 @@ from dexsim.calibration.maps import (
     save_calibration,
     taxel_force,
 )
-from dexsim.calibration.press import lever_arms
 from dexsim.core.errors import CalibrationError
 
 # --- lines -----------------------------------------------------------------------------------
@@ -257,13 +255,6 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         refused(path, hand)
 
 
-def test_a_missing_file_or_folder_is_one_line(hand, fitted, tmp_path):
-    with pytest.raises(CalibrationError, match="none.toml: cannot be read"):
-        load_calibration(tmp_path / "none.toml", hand)
-    with pytest.raises(CalibrationError, match="/proc/none/c.toml: cannot be written"):
-        save_calibration("/proc/none/c.toml", fitted[0])
-
-
 # --- what no hand gives -----------------------------------------------------------------------
 
 
@@ -378,26 +369,3 @@ def test_a_forged_file_is_refused_or_gives_torques_and_forces_of_a_hand(hand, so
     stalled = np.asarray(normalised_torque(calibration, np.full(12, 1.5, np.float32)))
     assert np.all(np.abs(idle) < 1.01) and np.all(np.abs(stalled) < 60)
     assert np.all(np.asarray(taxel_force(calibration, np.full((5, 1), 255.0, np.float32))) <= 255.0)
-
-
-# --- the simulation's side --------------------------------------------------------------------------
-
-
-def test_lever_arms_are_c_mujocos(hand):
-    """J^T n at a taxel, from mj_jac at the same point of the tip's body."""
-    rng = np.random.default_rng(6)
-    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
-    data = mujoco.MjData(model)
-    for finger in range(5):
-        angle = rng.uniform(hand.joint_lower, hand.joint_upper)
-        taxel = int(rng.integers(hand.num_taxels))
-        data.qpos[[model.joint(name).qposadr[0] for name in hand.joint_names]] = angle
-        mujoco.mj_forward(model, data)
-        body = model.body(hand.body_names[hand.tip_body[finger]]).id
-        turn = data.xmat[body].reshape(3, 3)
-        point = data.xpos[body] + turn @ hand.taxel_position[finger, taxel]
-        jacobian = np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jacobian, None, point, body)
-        torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
-        expected = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
-        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), expected, atol=2e-6)

@@ -79,7 +79,7 @@ def test_a_wrong_value_is_named_with_its_range_in_code_and_in_a_file(fields, exp
     st.floats(0, 2),
     st.sampled_from(["steel", "brass"]),
     st.lists(st.sampled_from(["red", "blue"]), max_size=3),
-    st.none() | st.text(max_size=5),
+    st.sampled_from([None, "", "ä \\", 'a"\n']),
     st.booleans(),
 )
 def test_any_config_survives_the_round_trip(stiffness, turns, low, high, wire, marks, name, wound):

@@ -150,30 +150,6 @@ def test_pictures_are_read_back_with_their_shape_and_statistics(filmed):
     assert np.shape(stats[name]["mean"]) == (3, 1, 1) and stats[name]["count"] == [20]
 
 
-def test_act_and_diffusion_of_lerobot_accept_the_features(filmed):
-    """By LeRobot's own rules its policies can be configured with the object's state, and with pictures."""
-    pytest.importorskip("lerobot")
-    from lerobot.configs.types import FeatureType
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.datasets.utils import dataset_to_policy_features
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-
-    data = LeRobotDataset("local/filmed", root=filmed)
-    features = dataset_to_policy_features(data.meta.features)
-    outputs = {name: feature for name, feature in features.items() if feature.type is FeatureType.ACTION}
-    inputs = {name: feature for name, feature in features.items() if name not in outputs}
-    state = {name: inputs[name] for name in ("observation.state", "observation.environment_state")}
-    for config in (ACTConfig, DiffusionConfig):
-        for given in (inputs, state):
-            made = config(input_features=given, output_features=outputs, device="cpu")
-            made.validate_features()
-            assert made.env_state_feature.shape == (8,) and made.robot_state_feature.shape == (12,)
-            assert made.action_feature.shape == (12,) and len(made.image_features) == (given is inputs)
-    frame = data[3]
-    assert tuple(frame["observation.images.scene"].shape) == (3, 24, 32) and len(frame["action"]) == 12
-
-
 # --- episodes for the live view -------------------------------------------------------------------------
 
 

@@ -101,7 +101,7 @@ class TestTick:
         starts = c_scene.row(pool, rows)
         state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.object)
         for _ in range(8):
-            state = grasp_rollout.step(state, jnp.ones((WORLDS, 12)) * (np.arange(12) > 3))
+            state = grasp_rollout.step(state, np.tile(np.float32(np.arange(12) > 3), (WORLDS, 1)))
         action = actions(3)
         after = grasp_rollout.step(state, action)
         push = jax.vmap(lambda key, target: grasp_env.task.push(jax.random.split(key, 4)[1], target))(
@@ -165,7 +165,7 @@ class TestTick:
         drive = c_scene.row(after.episode.hand.actuator, slice(None))
         position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
         torque = plain_drive(drive, np.asarray(after.joint_target), position, velocity)
-        np.testing.assert_allclose(after.joint_torque * hand.torque_limit, torque, atol=2e-5)
+        np.testing.assert_allclose(np.asarray(after.joint_torque) * hand.torque_limit, torque, atol=2e-5)
 
     def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
@@ -211,7 +211,7 @@ class TestEpisodes:
         assert after.tick.tolist() == (tick + 1).tolist()
         assert np.all(after.length == 1)
         drop = grasp_env.config.reward.drop
-        np.testing.assert_array_equal(after.metrics["reward/drop"], drop * after.terminated)
+        np.testing.assert_array_equal(after.metrics["reward/drop"], drop * np.asarray(after.terminated))
 
     def test_returns_add_up(self, history):
         total = np.zeros(WORLDS)

@@ -18,7 +18,6 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.env.task import reward_of
-from dexsim.errors import ConfigError
 
 WORLDS = 4
 
@@ -122,15 +121,3 @@ def test_a_reward_may_be_any_number(reward):
     """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
     found, _ = outcome(reward, {})
     assert (found.shape, found.dtype, float(found)) == ((), jnp.float32, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("reward", "metrics", "message"),
-    [
-        (jnp.zeros(2), {}, r"reward must be a scalar; got shape \(2,\)"),
-        (0.0, {"far": jnp.zeros(3)}, r"far must be a scalar; got shape \(3,\)"),
-    ],
-)
-def test_rules_that_give_something_else_are_one_line(reward, metrics, message):
-    with pytest.raises(ConfigError, match=f"^task 'balance': {message}"):
-        outcome(reward, metrics)

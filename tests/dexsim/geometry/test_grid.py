@@ -25,11 +25,6 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path / "cache"))
 
 
-def box_distance(points, half=BOX):
-    q = np.abs(points) - half
-    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
-
-
 def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
     """Points [P, 3] within `low` to `high` of the surface, with exact distance and normal."""
     box = bounds(shape)
@@ -40,12 +35,6 @@ def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
 
 
 # --- meshes --------------------------------------------------------------------------------------
-
-
-def test_distance_to_a_box_mesh_is_the_closed_form():
-    box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
-    np.testing.assert_allclose(mesh.signed_distance(box, points), box_distance(points), atol=1e-12)
 
 
 def turned(part):

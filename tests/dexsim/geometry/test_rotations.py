@@ -1,7 +1,6 @@
 """Rotations against C MuJoCo, NumPy and hand-made cases."""
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -16,12 +15,6 @@ AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 ANGLES = RNG.uniform(-7, 7, 64)
 
 
-def mujoco_matrix(quat):
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quat, float))
-    return out.reshape(3, 3)
-
-
 def f32(x):
     return np.asarray(x, np.float32)
 
@@ -30,32 +23,6 @@ def f32(x):
 def turned_angle(start, axis, angle):
     """Angle between `start` and `start` turned."""
     return rotations.quat_angle(start, rotations.quat_multiply(rotations.axis_angle_to_quat(axis, angle), start))
-
-
-def test_quaternion_to_matrix_is_mujocos():
-    ours = rotations.quat_to_matrix(f32(QUATS))
-    np.testing.assert_allclose(ours, [mujoco_matrix(q) for q in QUATS], atol=1e-6)
-    np.testing.assert_allclose(rotations.quat_to_matrix(-f32(QUATS)), ours, atol=0)
-
-
-def test_axis_angle_both_ways_is_mujocos():
-    wanted = np.zeros((64, 4))
-    for row, axis, angle in zip(wanted, AXES, ANGLES, strict=True):
-        mujoco.mju_axisAngle2Quat(row, axis, angle)
-    quat = rotations.axis_angle_to_quat(f32(AXES), f32(ANGLES))
-    np.testing.assert_allclose(quat, wanted, atol=1e-6)
-    matrix = rotations.axis_angle_to_matrix(f32(AXES), f32(ANGLES))
-    np.testing.assert_allclose(matrix, [mujoco_matrix(q) for q in wanted], atol=2e-6)
-
-
-def test_quaternion_product_and_inverse_are_mujocos():
-    left, right = QUATS, QUATS[::-1]
-    wanted = np.zeros((64, 4))
-    for row, a, b in zip(wanted, left, right, strict=True):
-        mujoco.mju_mulQuat(row, a, b)
-    np.testing.assert_allclose(rotations.quat_multiply(f32(left), f32(right)), wanted, atol=1e-6)
-    unit = rotations.quat_multiply(rotations.quat_conjugate(f32(left)), f32(left))
-    np.testing.assert_allclose(unit, np.tile([1, 0, 0, 0], (64, 1)), atol=1e-6)
 
 
 @given(st.floats(1e-5, np.pi - 1e-3), st.integers(0, 63), st.integers(0, 63))

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from dexsim import check_hand, import_hand
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
-from dexsim.hand.fit import fit_capsule
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
@@ -216,14 +215,3 @@ def test_the_frame_is_confirmed(tmp_path):
     orient(draft, along=(0, 0, 2), normal=(-1, 0, 0.1))
     (link,) = (link for link in draft.links if link.joint == "f_a")
     assert draft.side == "left" and abs(link.axis[1]) == 1 and link.anchor[2] == 0.05
-
-
-def test_a_capsule_is_fitted_to_itself():
-    """Ends and radius come back within the facets of the mesh, however it lies."""
-    turn, radius, length = Rotation.from_euler("xyz", [0.3, 1.2, -0.7]).as_matrix(), 0.008, 0.03
-    bar = trimesh.creation.capsule(height=length, radius=radius, count=[32, 32])
-    bar.apply_translation([0, 0, -bar.bounds.mean(0)[2]])
-    bar.apply_transform(transform(turn))
-    fit = fit_capsule(bar, turn @ [0.1, 0, 0.995])
-    np.testing.assert_allclose(fit.ends, [-length / 2 * turn[:, 2], length / 2 * turn[:, 2]], atol=3e-4)
-    assert abs(fit.radius - radius) < 1e-4 and fit.error[1] < 3e-4

@@ -274,18 +274,3 @@ def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
     log = dataclasses.replace(JointLog(PERIOD, TARGET, TARGET + 0.01, None, "thumb_bend"), **changes)
     with pytest.raises(CalibrationError, match=f"^thumb_bend.*{says}"):
         check_log(log)
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (dict(fit=("dead_band",)), "cannot fit 'dead_band'"),
-        (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
-        (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside"),
-        (dict(holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10])), "at least 200 samples"),
-    ],
-)
-def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
-    options = {"start": GUESS} | options
-    with pytest.raises(CalibrationError, match=says):
-        identify(smooth_log, options.pop("start"), **options)

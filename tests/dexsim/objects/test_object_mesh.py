@@ -108,7 +108,8 @@ class TestDraw:
 
     def test_sizes_masses_and_inertia_are_of_the_solid(self, folder):
         config = self.config(folder, inertia_scale=(1.0, 1.0))
-        drawn = jax.vmap(lambda key: sample_object(key, config))(jax.random.split(jax.random.key(0), 200))
+        draw = jit(jax.vmap(lambda key: sample_object(key, config)), once=True)
+        drawn = draw(jax.random.split(jax.random.key(0), 200))
         sides = 2 * np.asarray(drawn.size[:, 0])
         factor = sides[:, 0] / 0.05
         np.testing.assert_allclose(sides, factor[:, None] * [0.05, 0.036, 0.064], rtol=1e-4)

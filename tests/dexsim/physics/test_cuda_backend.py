@@ -1,14 +1,17 @@
 """The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU; each
 task's kernel through NVRTC, which needs no GPU."""
 
+import ctypes
 import dataclasses
 import math
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp_emulation
+from episodes import POOL_SIZE
 
 import dexsim
 from dexsim.core.compilation import jit
@@ -17,6 +20,7 @@ from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi, physics as engines
 from dexsim.physics.cuda import backend, launch, program
 from dexsim.physics.physics import Physics
+from dexsim.tasks.rotate.config import RotateConfig
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 
@@ -98,16 +102,18 @@ def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
 
 
 @pytest.mark.parametrize("task", ["rotate", "grasp"])
-def test_tasks_compile(task, emulated, monkeypatch):
+def test_tasks_compile(task, grasp_env, emulated, monkeypatch):
     try:
         compiler = program.find_compiler()
     except ConfigError as error:
         pytest.skip(str(error))
+    for path in Path(compiler._library._name).parent.glob("libnvrtc-builtins.so*"):
+        ctypes.CDLL(str(path))  # NVRTC looks for it by its name alone
     texts = []
     monkeypatch.setattr(backend, "source", program.source)
     monkeypatch.setattr(backend, "compile_kernel", lambda text, _: texts.append(text))
     monkeypatch.setattr(launch, "load", lambda *_: "0")
-    env = dexsim.make(task, backend="c")
+    env = grasp_env if task == "grasp" else dexsim.make(task, RotateConfig(pool_size=POOL_SIZE), backend="c")
     states = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 1))
     for _ in range(2):
         jax.eval_shape(tick_of(env, physics_of(env, "cuda")), states)

@@ -14,7 +14,6 @@ from paths import DATA
 from two_fingers import write
 
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError
 from dexsim.hand.load import load_hand
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
@@ -99,14 +98,3 @@ def test_reverse_mode_agrees_with_forward_mode(hand, linearized, moment):
     reverse = jit(lambda x: jax.vjp(outcome, x)[1](WEIGHT)[0], once=True)(moment)
     forward = [WEIGHT @ linearized(moment, way)[1] for way in np.eye(4, dtype=np.float32)]
     np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5)
-
-
-def test_what_mjx_refuses_is_named(hand, monkeypatch):
-    from mujoco import mjx
-
-    def refuse(model, **_):
-        raise NotImplementedError("no such joint")
-
-    monkeypatch.setattr(mjx, "put_model", refuse)
-    with pytest.raises(AssetError, match="backend mjx: no such joint"):
-        outcome_on(hand, "mjx")

@@ -1,6 +1,7 @@
 """Touch against closed forms: Mooney-Rivlin, flat punch; reduction; gradients. With any object and law: link frames
 against the palm frame, methods of distance, materials."""
 
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -23,6 +24,7 @@ reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
 skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
 
 
+@functools.partial(jax.jit, static_argnames="skin")
 def feel(taxels, area, geometry, position, rotation, finger_force, skin, pad_thickness_delta=0.0):
     """`compute_touch` for taxels [F, N, 3] m of `area` [F, N] m^2 in the palm's frame, as of links all at the palm."""
     fingers = len(taxels)

@@ -211,28 +211,6 @@ for name in {recorded}:
         assert camera in ("grasp", "rotate") and int(frames) > 200 and (touching, jax) == ("True", "None")
 
 
-# What is asked for, and what must be said about it.
-NEEDS_JAX = {
-    'main(["train"])': "dexsim train",
-    "import dexsim; dexsim.make": "dexsim.make",
-    "import dexsim_ppo; dexsim_ppo.load_policy": "dexsim_ppo.load_policy",
-    'main(["demo", "juggle"])': "showing juggle",
-}
-
-
-def test_what_the_base_install_cannot_do_names_the_extra():
-    said = python_without_jax(f"""
-from dexsim.__main__ import main
-for code in {list(NEEDS_JAX)}:
-    try:
-        exec(code)
-    except Exception as error:
-        print(error)
-""")
-    for line, what in zip(said, NEEDS_JAX.values(), strict=True):
-        assert line.startswith(f"{what} needs jax: pip install -e '.[train]'")
-
-
 def test_poses_for_pictures_are_those_of_the_kinematics(hand):
     joints = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (4, hand.num_joints))
     for angles, drawn in zip(joints, hand_poses(hand, joints), strict=True):

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from tiny_env import TinyConfig, TinyEnv
 
-pytest.importorskip("stable_baselines3")
-from stable_baselines3 import PPO
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from dexsim.wrappers.sb3 import SB3VecEnv
+@pytest.fixture(autouse=True)
+def sb3():
+    """Loads torch, for seconds."""
+    pytest.importorskip("stable_baselines3")
 
 
 def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_termination():
+    from dexsim.wrappers.sb3 import SB3VecEnv
+
     # The first environment runs off the field, the second stays on it until the time limit.
     env = SB3VecEnv(TinyEnv(TinyConfig(horizon=6, gain=1.0, wall=1.5)), 2)
     env.seed(5)
@@ -31,6 +32,12 @@ def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_terminati
 
 @pytest.mark.slow
 def test_its_ppo_learns():
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+    from dexsim.wrappers.sb3 import SB3VecEnv
+
     env = VecNormalize(VecMonitor(SB3VecEnv(TinyEnv(), 32)), gamma=0.95)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=256, gamma=0.95, learning_rate=3e-3, seed=0, device="cpu")
     before, _ = evaluate_policy(model, env, 64)

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from episodes import POOL_SIZE
 
 import dexsim
 from dexsim.objects.config import ObjectConfig
@@ -60,5 +61,5 @@ def test_grasp():
 def test_rotate():
     """Goals half a radian apart, some of which are found. An idle hand reaches those that a start is near."""
     turn = TurnSpec(spin=2.0, step=0.5)
-    config = RotateConfig(pool_size=32, episode_seconds=3.0, turn=turn, randomization=NOMINAL)
+    config = RotateConfig(pool_size=POOL_SIZE, episode_seconds=3.0, turn=turn, randomization=NOMINAL)
     assert learns("rotate", config, 60.0, window=10)

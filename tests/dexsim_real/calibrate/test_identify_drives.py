@@ -9,7 +9,6 @@ import pytest
 from calibrating import arguments, off, operator
 from press_bench import BenchHand
 
-from dexsim.calibration.maps import save_calibration
 from dexsim.core.errors import CalibrationError
 from dexsim_real.calibrate import identify_drives
 from dexsim_real.calibrate.bench import CalibrateArguments
@@ -132,15 +131,6 @@ def test_exchanges_that_are_slow_or_missing_identify_nothing_and_a_late_one_does
     monkeypatch.setattr(press_bench, "EXCHANGE", 0.020)
     with pytest.raises(LogError, match="exchanges took 24.1 ms, expected 12.0 ms"):
         fitted_log(moved(hand, tmp_path / "slow.log"), hand)
-
-
-def test_a_calibration_of_another_hand_is_refused_for_a_log(hand, recorded, tmp_path):
-    save_calibration(tmp_path / "other.toml", dataclasses.replace(ideal_calibration(hand), serial="2R32OTHER"))
-    options = CalibrateArguments(
-        from_log=(recorded,), identify=True, calibration=tmp_path / "other.toml", output=tmp_path / "hand.json"
-    )
-    with pytest.raises(HandError, match="this is hand 2R32BENCH, the calibration is of hand 2R32OTHER"):
-        identify_hand(options, hand, operator())
 
 
 def test_a_joint_that_fails_leaves_those_of_the_others(hand, recorded, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """From measurements to targets as in the simulation; silent sensors of the object; goals of the rotation task."""
 
-import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -9,26 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from remembering import remembering
-from simple_physics import SimplePhysics
 from test_safety import CYCLE, MIDDLE, Bench
 
-from dexsim.control import Control
-from dexsim.env.config import Sensing
-from dexsim.env.env import Env
 from dexsim.env.sensors import SensorSuite
-from dexsim.env.state import Start
-from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
-from dexsim.physics.interface import StepResult
-from dexsim.randomization import Randomization
-from dexsim.sensing.imu import ImuConfig
-from dexsim.sensing.taxels import TaxelSensor
 from dexsim.task_spec import TaskSpec, TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
-from dexsim.tasks.rotate.start import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate, goal_quat
 from dexsim_real.control.controller import Controller, PolicyLoop, Tick, TurnGoals
 from dexsim_real.control.safety import Reaction
@@ -36,36 +24,6 @@ from dexsim_real.sensors.camera import ObjectEstimate, ObjectSensors
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import IDENTITY, ImuReader, encode
 from dexsim_real.wire import frames
-
-QUIET = Sensing(
-    joint_noise=0.0,
-    joint_resolution=0.0,
-    torque_noise=0.0,
-    object_noise=0.0,
-    orientation=ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
-    taxel=TaxelSensor(noise=0.0),
-)
-
-
-class Turning(SimplePhysics):
-    """Its object is touched where it stays, and turns about x."""
-
-    def advance(self, law, object, state, *others):
-        result = super().advance(law, object, state, *others)
-        turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
-        qpos = jnp.concatenate([result.state.qpos[:12], state.qpos[12:15], turned])
-        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * qpos[:5])) * 3)
-        return StepResult(dataclasses.replace(result.state, qpos=qpos), force)
-
-
-class StillRotate(Rotate):
-    """The task, but with one start state made on the spot."""
-
-    def make_pool(self, key):
-        place = jnp.concatenate([jnp.asarray(self.reference), jnp.array([1.0, 0, 0, 0])])
-        qpos = jnp.concatenate([jnp.asarray(self.config.posture), place])
-        object = sample_turned_object(key, self.config)
-        return jax.tree.map(lambda x: x[None], Start(qpos=qpos, qvel=jnp.zeros(18), object=object))
 
 
 class Acts:
@@ -128,53 +86,6 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         assert simulated.dtype == tick.observation.dtype == np.float32
         assert simulated.tobytes() == tick.observation.tobytes()
         assert len(simulated) == (66 if task.name == "grasp" else 92)
-
-
-def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
-    """The real `Env.step` over simple physics, and the bridge fed with frames of what that hand measured."""
-    monkeypatch.setattr("dexsim.env.env.Physics", Turning)
-    config = RotateConfig(
-        sensing=QUIET,
-        randomization=Randomization(scale=0.0),
-        pool_size=1,
-        edge=(0.11, 0.11),
-        control=Control(step=0.08),
-    )
-    task = StillRotate(config, hand)
-    weights = np.random.default_rng(0).normal(size=(92, 12)).astype(np.float32) * 0.3
-
-    def act(observation):
-        return jnp.tanh(jnp.asarray(observation) @ weights)
-
-    env = Env(task, hand)
-    state, step = jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
-    controller = Controller(Acts(task, hand, act), hand)
-    controller.start(np.asarray(state.joint_target))
-    sensing = HandSensing(hand, HardwareConfig())
-    at = [f.name for f in controller.policy.observation_layout].index("last_action")
-    begin = sum(f.size for f in controller.policy.observation_layout[:at])
-    actions, touched = [np.zeros(12, np.float32)], 0
-    for _ in range(10):
-        readings = state.readings
-        block = frames.empty_state()
-        block["joint"]["position"] = readings.joint_position
-        block["tip"]["taxel"]["z"] = np.round(np.asarray(readings.taxel_force) / 0.1)
-        seen = ObjectEstimate(
-            readings.object_position, readings.object_velocity, readings.object_quat, readings.palm_gravity
-        )
-        tick = controller.tick(sensing.measure(block), seen, readings.goal_quat, 0.0)
-        # The action in the observation is the one that led to this measurement, not the one it leads to.
-        np.testing.assert_array_equal(tick.observation[begin : begin + 12], actions[-1])
-        np.testing.assert_array_equal(tick.readings.last_action, actions[-1])
-        np.testing.assert_allclose(tick.readings.last_action, readings.last_action, atol=1e-5)
-        np.testing.assert_allclose(tick.readings.past_actions, readings.past_actions, atol=1e-5)
-        np.testing.assert_allclose(tick.observation, state.obs["actor"], atol=2e-5)
-        actions.append(tick.action)
-        touched += bool(np.any(readings.taxel_force))
-        state = step(state, act(state.obs["actor"]))
-        np.testing.assert_allclose(tick.target, state.joint_target, atol=1e-5)
-        np.testing.assert_allclose(tick.action, state.action, atol=1e-5)
-    assert np.abs(np.diff(actions, axis=0)).max() > 0.05 and touched > 4
 
 
 def test_an_action_that_is_not_finite_counts_as_none(hand):

@@ -266,13 +266,6 @@ def test_half_an_hour_of_warming_leaves_next_to_nothing(hand, held, free):
     assert untracked.min() > 0.05 * LIMIT
 
 
-def test_a_zero_that_has_moved_far_is_told_once(sensing):
-    sensing.set_tare([state()] * 5)
-    sensing.tare = sensing.tare + np.float32(0.5) * (np.arange(5)[:, None] == 2)  # 60 counts of the middle's 120 taxels
-    told = [line for time in (0.0, 0.1, 0.2) for line in sensing.follow_taxels(time, state(), LIMIT)[1]]
-    assert len(told) == 1 and told[0].startswith("middle: its zero has moved by ")
-
-
 def test_a_residue_after_a_release_is_found(sensing):
     """20 taxels that read one count after 8 N: a zero that jumped comes back within minutes, not never."""
     residue, loaded = state(), state()

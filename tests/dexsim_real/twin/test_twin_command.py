@@ -11,12 +11,9 @@ import pytest
 from paths import ROOT
 
 pytest.importorskip("serial")
-import twin_plant
 from twin_plant import ScriptedPlant
 
 from dexsim.calibration.maps import load_calibration
-from dexsim.core.errors import DexsimError
-from dexsim_real.twin import __main__ as twin_command
 from dexsim_real.twin.__main__ import SLICE, Twin, TwinArguments
 from dexsim_real.twin.wire import FORCE_PER_COUNT, SERIALS
 
@@ -73,16 +70,3 @@ def test_the_command_offers_a_calibration_and_ends_after_its_trials_or_when_it_i
     report = json.loads((tmp_path / "out.json").read_text())
     assert [row["trial"] for row in report["trials"]] == [0, 1] and report["line"] == {}
     assert not os.path.lexists(shown.split("--port ")[1].split()[0])
-
-
-def test_a_wrong_option_is_an_error_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(twin_command, "make_plant", twin_plant.make)
-    (tmp_path / "masks").touch()
-    for options, says in (
-        ("--task juggle", "choose from grasp, rotate"),
-        (f"--folder {tmp_path}/no", "no pseudo-terminal"),
-        (f"--task grasp --folder {tmp_path}", "socket for masks cannot be created .* remove the file"),
-    ):
-        with pytest.raises(DexsimError, match=says) as error:
-            twin_command.main([*options.split(), "--no-realtime"])
-        assert "\n" not in str(error.value)

@@ -117,17 +117,6 @@ def test_motors_count_as_off_only_when_the_hand_says_so(leap):
     assert port.turn_off(off(leap), 0.02)
 
 
-def test_what_a_hand_does_not_measure_is_said_in_a_line_each(leap):
-    whole, lines = (
-        DriverPort(ScriptedDriver(leap, measures), leap, LinkConfig()).greet(leap, None)
-        for measures in (WITHOUT, ["currents"])
-    )
-    assert whole[0] == "scripted" and len(whole) == 2 and "does not tell its serial number" in whole[1]
-    assert [line.split(":")[1] for line in lines[1:3]] == [" no taxels", " no temperatures"]
-    assert "--safety.finger-force" in lines[1] and "--safety.temperature" in lines[2]
-    assert all(field in WITHOUT[need] for field, needs in NEEDS.items() for need in needs)
-
-
 @pytest.mark.parametrize(
     ("measures", "observation", "says"),
     [
@@ -291,12 +280,6 @@ def test_no_state_without_the_whole_answer_of_every_motor(bus, driver, monkeypat
     monkeypatch.setattr("dexsim_real.wire.dynamixel._MARGIN", 0.05)
     with pytest.raises(HandError, match="no answer of the motors 3, 8; check .* baud rate"):
         driver.connect()
-
-
-@pytest.mark.parametrize("ids", [[1, 1, 2], [0, 253]])
-def test_ids_that_no_bus_can_have_are_refused(ids):
-    with pytest.raises(HandError, match="different numbers from 0 to 252"):
-        DynamixelHand("/dev/null", ids)
 
 
 def test_the_bridge_over_the_bus_reaches_a_target_and_stops_at_a_motor_that_shuts_down(bus, driver):

@@ -10,6 +10,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from episodes import POOL_SIZE
 from paths import ROOT
 
 import dexsim_real.twin.plant
@@ -63,10 +64,9 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
 
 
 @pytest.mark.parametrize("task", ("rotate", "rotate_clear"))
-def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path, task):
-    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, task):
     entry = TRAINED[task]
-    rules = entry.task(dataclasses.replace(entry.config(), pool_size=32), hand)
+    rules = entry.task(dataclasses.replace(entry.config(), pool_size=POOL_SIZE), hand)
     starts, place = rules.make_pool(jax.random.key(0)).qpos[:, 12:15], start_of(hand, task).place
     assert np.all(np.abs(starts.mean(0)[-len(place) :] - place) < 0.6 * starts.std(0)[-len(place) :])
 

@@ -1,16 +1,13 @@
-"""The emulated IMU and camera, read by the bridge's own IMU reader and camera."""
+"""The silhouettes of the emulated camera, and heights from them."""
 
 import math
-import time
 
 import numpy as np
 import pytest
 
 pytest.importorskip("serial")
-from twin_pair import Running
 
-from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.camera import CameraConfig, HeightSensor, height_of, open_masks
+from dexsim_real.sensors.camera import CameraConfig, height_of
 from dexsim_real.twin import wire
 from dexsim_real.twin.plant.shapes import Primitive
 
@@ -35,18 +32,3 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
     assert not wire.silhouette([cube + [0, 0.6, 0]], OPTICS).any()
     flat = cube * [1, 1, 0] + [0, 0, OPTICS.position[2]]
     assert wire.silhouette([flat], OPTICS).sum() < 100
-
-
-def test_the_bridges_camera_sees_the_object(tmp_path):
-    begin = time.monotonic()
-    with Running(tmp_path, task="grasp", seed=3) as running:
-        masks = open_masks(f"unix:{running.twin.sensor.path}", OPTICS)
-        sensor = HeightSensor(masks, OPTICS, np.array([0.06, 0.0, 0.071]), (True, False, False), 0.3)
-        while sensor.newest is None or running.twin.sensor.sent < 10:
-            time.sleep(0.01)
-        when, position, _ = sensor.read()
-        assert position[0] == pytest.approx(0.047, abs=0.002) and when <= time.monotonic()
-        sensor.close()
-        assert running.twin.sensor.sent <= 2 + 1.1 * wire.CAMERA_RATE * (time.monotonic() - begin)
-    with pytest.raises(HandError, match="no program sends masks"):
-        open_masks(f"unix:{running.twin.sensor.path}", OPTICS)

@@ -1,4 +1,4 @@
-"""The emulated line: timing in virtual time, the bridge's driver on it, and the name of its terminal."""
+"""The emulated line: timing in virtual time, and the name of its terminal."""
 
 import os
 
@@ -7,14 +7,12 @@ import pytest
 from hypothesis import given, strategies as st
 
 pytest.importorskip("serial")
-from twin_pair import Cable, Running, command, request
-from twin_plant import REST
+from twin_pair import Cable, request
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.wire import Terminal
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
-from dexsim_real.wire.link import LinkConfig, SerialHand
+from dexsim_real.wire.frames import HAND_REPLIES, Command, Parser
 
 
 def test_an_exchange_takes_what_it_takes_on_the_hand_and_comes_in_pieces():
@@ -42,22 +40,6 @@ def test_noise_on_the_line_is_answered_with_silence(noise):
     answered = cable.ask(noise, 0.05) != []
     assert answered <= (Parser(frames.HOST_REQUESTS).feed(noise) != [])
     assert cable.ask(request(), 0.05) != []
-
-
-def test_the_driver_talks_to_it(tmp_path):
-    with Running(tmp_path, task="rotate") as running:
-        port = SerialHand(running.port, LinkConfig(settle=0.0, margin=1.0))
-        assert "firmware 1.3.9" in port.connect()
-        goal, replies = REST + 0.05, []
-        for k in range(30):
-            replies.append(port.exchange(command(REST if k < 2 else goal)))
-        port.close()
-    first, last = replies[0].state["joint"], replies[-1].state["joint"]
-    np.testing.assert_allclose(first["position"], REST, atol=1e-3)
-    np.testing.assert_allclose(last["position"], goal, atol=3e-3)
-    assert port.counts.sent == port.counts.answered == running.twin.line.counts["answers"] == 34
-    assert np.median([reply.received - reply.sent for reply in replies]) > 0.0095
-    assert np.all(last["raw_position"] & 0xF == Mode.POSITION)
 
 
 def test_a_terminal_keeps_its_name(tmp_path):
