@@ -179,7 +179,11 @@ def find_compiler() -> Compiler:
     """
     for path in _candidates():
         with contextlib.suppress(OSError):
-            return Compiler(ctypes.CDLL(str(path)))
+            library = ctypes.CDLL(str(path))
+            # NVRTC opens its builtins by their name alone, which finds them only once they are loaded.
+            for builtins in Path(path).parent.glob("libnvrtc-builtins.so*") if isinstance(path, Path) else ():
+                ctypes.CDLL(str(builtins))
+            return Compiler(library)
     raise ConfigError(f"backend 'cuda' needs NVRTC, which comes with JAX for CUDA: {install_line('cuda')}")
 
 
