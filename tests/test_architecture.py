@@ -65,15 +65,15 @@ BUDGETS = {
     "dexsim/core": 845,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_265,  # goal: 1,900
     "dexsim/hand dexsim/objects": 2_610,  # goal: 1,900
-    "dexsim/physics": 2_340,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/physics": 2_345,  # goal: 2,200, and 1,300 of CUDA
     "dexsim/env dexsim/tasks": 2_520,  # goal, with the roots: 3,200
     ROOTS: 1_465,
     "dexsim/calibration dexsim/identification": 1_445,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_075,  # goal: 1,900
-    "dexsim_ppo": 3_830,  # goal: 4,000
+    "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_560,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 20_200,  # goal: 18,000
+    "tests": 20_195,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -111,7 +111,7 @@ class Run:
         per_iteration = self.config.steps_per_iteration
         iteration = first = int(state.iteration)
         begin, calls_s = time.perf_counter(), list[float]()
-        faults, evaluated = Faults(self.config, state), iteration == 0
+        faults, evaluated = Faults(self.config, self.folder, state), iteration == 0
         while not stopped() and not processes.agree(self._is_over(iteration)):
             call = time.perf_counter()
             state, metrics = step(state)
@@ -286,9 +286,10 @@ class Run:
 class Faults:
     """Counts updates that were skipped because their gradient was not finite."""
 
-    def __init__(self, config: PPOConfig, state: TrainState):
+    def __init__(self, config: PPOConfig, folder: RunFolder, state: TrainState):
         self._per_call = config.iterations_per_call * config.epochs * config.minibatches
-        self._skipped, self._sound, self._bad_calls = int(state.skipped_updates), int(state.iteration), 0
+        self._folder, self._skipped, self._sound = folder, int(state.skipped_updates), int(state.iteration)
+        self._bad_calls = 0
 
     def check(self, skipped: int, iteration: int) -> None:
         """Raises DexsimError: most updates of several calls in a row were `skipped`, which counts all of the run's."""
@@ -297,9 +298,11 @@ class Faults:
         if not lost:
             self._sound = iteration
         if self._bad_calls >= DIVERGED_AFTER:
+            sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
             raise DexsimError(
                 f"training diverged: in each of the last {DIVERGED_AFTER} calls most gradients were not finite, the "
-                f"first one after iteration {self._sound}; --resume takes a checkpoint from before"
+                f"first one after iteration {self._sound}; "
+                + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
             )
 
 
