@@ -110,7 +110,7 @@ def fingertip_strength(hand: Hand, joint_position: Array) -> np.ndarray:
 
     facing = np.array(taxel_normals(hand, forward_kinematics(hand, joint_position)).mean(1))
     facing /= np.linalg.norm(facing, axis=-1, keepdims=True)
-    lever = np.abs(np.einsum("fk,fkj->fj", facing, jax.jacfwd(pads)(joint_position)))
+    lever = np.abs(np.einsum("fk,fkj->fj", facing, jax.jit(jax.jacfwd(pads))(joint_position)))
     return (hand.torque_limit / np.maximum(lever, 1e-6)).min(-1)
 
 
