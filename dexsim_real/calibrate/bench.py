@@ -221,6 +221,7 @@ class Bench(ExchangeLoop):
         super().__init__(port, sensing, safety, arguments.rate, track_taxels=False, **clock)
         self._newest: dict[str, Any] = {}  # the last exchange, as the log has it
         self._failing_since: float | None = None
+        self._connection: int | None = None
 
     def __enter__(self) -> "Bench":
         arguments, hand = self.arguments, self.sensing.hand
@@ -322,8 +323,10 @@ class Bench(ExchangeLoop):
             raise HandError(f"stopped: {safety.latched}")
         if self.log.failure:
             raise HandError(f"stopped: the log is lost ({self.log.failure})")
-        if sample is not None and sample.generation > 1:
-            raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
+        if sample is not None:
+            if self._connection not in (None, sample.generation):
+                raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
+            self._connection = sample.generation
         reaction, reason = safety.last
         working = sample is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now
