@@ -80,7 +80,7 @@ BUDGETS["long"] = dataclasses.replace(
     name="long",
     level=3,
     training={"grasp": {"steps": 1.5e8, "evaluate_every": 0}, "rotate": {"steps": 1e8, "evaluate_every": 0}},
-    trials={"grasp": 50, "rotate": 3},
+    trials={"grasp": 50, "rotate": 6},
 )
 
 

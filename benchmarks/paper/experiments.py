@@ -89,7 +89,7 @@ _READINGS = (
     ("nothing", "nothing ablated", ()),
     ("force", "contact force ablated", ("contact_force",)),
     ("centre", "contact centre ablated", ("contact_centre",)),
-    ("touch", "both ablated", ("contact_force", "contact_centre")),
+    ("touch", "both ablated", measure.TOUCH),
     ("orientation", "orientation ablated", ("relative_orientation",)),
 )
 
@@ -112,7 +112,7 @@ _ROUGH = ("push_probability=0.01", "push_speed=0.2", "objects.friction=[0.2,1.6]
 def _map_rows() -> Iterator[Row]:
     """Each world with and without touch. Of what the emulated hand draws, `plant` fixes what the world is about."""
     for orientation, object, rough, touch in itertools.product(_ORIENTATIONS, _OBJECTS, (False, True), (True, False)):
-        left_out = [] if touch else ["contact_force", "contact_centre"]
+        left_out = [] if touch else [*measure.TOUCH]
         left_out += ["relative_orientation"] if orientation == "none" else []
         world = f"{orientation}, {object}, {'rough' if rough else 'as trained'}"
         error, sensing = _ORIENTATIONS[orientation]

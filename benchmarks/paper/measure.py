@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import zero_shot
 
 import dexsim
 from dexsim.core.config import from_dict, override, to_dict
+from dexsim.core.layout import is_of
 from dexsim.env.env import Env
 from dexsim.registry import find_task
 from dexsim.tasks.grasp.config import GraspConfig
@@ -42,15 +42,16 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
     policy, training = train(row, seed, budget, work) if budget.training else (row.skill, None)
+    loaded = load_policy(policy)
     task = "rotate_any" if any("cylinder" in setting for setting in row.settings) else row.skill
     given = tuple((name, float(value)) for name, _, value in (item.partition("=") for item in row.plant))
     report = {
-        "simulation": simulate(load_policy(policy), (), budget),
+        "simulation": simulate(loaded, (), budget),
         "hand": trials(task, policy, seed, budget.name, given),
     }
     if row.plant:
         report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
-        report |= without_touch(load_policy(policy), budget)
+        report |= without_touch(loaded, budget)
     return report | {"training": training}
 
 
@@ -149,8 +150,7 @@ class AnotherTouch(Evaluator):
 
     def seen(self, observation: jax.Array) -> jax.Array:
         """The observations [chunk, n] with touch from half a chunk further."""
-        layout = self.env.observation_layout["actor"]
-        touch = np.concatenate([np.full(entry.size, entry.name in TOUCH) for entry in layout])
+        touch = is_of(self.env.observation_layout["actor"], TOUCH)
         return jnp.where(touch, jnp.roll(observation, self.chunk // 2, axis=0), observation)
 
 

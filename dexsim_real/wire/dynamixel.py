@@ -6,6 +6,7 @@ gains. An angle of 0 is the middle of the encoder's turn, 180 degrees in the mak
 registers are those of the maker's e-manual (protocol 2.0; XL330, XC330).
 """
 
+import functools
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -62,10 +63,16 @@ def crc16(data: bytes | bytearray) -> int:
     """CRC-16 of the protocol: polynomial 0x8005, start 0, not reflected; 0xFEE8 for b"123456789"."""
     value = 0
     for byte in data:
-        value ^= byte << 8
-        for _ in range(8):
-            value = (value << 1) ^ (0x18005 if value & 0x8000 else 0)
+        value = (value << 8 & 0xFFFF) ^ _crc_row(value >> 8 ^ byte)
     return value
+
+
+@functools.cache
+def _crc_row(byte: int) -> int:
+    value = byte << 8
+    for _ in range(8):
+        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+    return value & 0xFFFF
 
 
 def packet(motor: int, instruction: int, data: bytes) -> bytes:
