@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -142,7 +143,11 @@ def check_no_overwrite(outputs: Mapping[str, Path | None], inputs: Mapping[str, 
 
 def write_json(path: Path, data: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    write_atomic(path, [(json.dumps(plain(data), indent=1) + "\n").encode()])
+    text = json.dumps(plain(data), indent=1)
+    # A list without lists on one line; the text of a JSON string has no line breaks.
+    flat = re.compile(r"\[\n\s+([^][{}]*?)\n\s+\]")
+    text = flat.sub(lambda found: "[" + re.sub(r"\n\s+", " ", found[1]) + "]", text)
+    write_atomic(path, [(text + "\n").encode()])
 
 
 def plain(value: Any) -> Any:
