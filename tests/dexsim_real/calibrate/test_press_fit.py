@@ -16,7 +16,7 @@ from dexsim.core.errors import CalibrationError
 from dexsim.touch.reduce import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.bench import CalibrateArguments
-from dexsim_real.calibrate.press_fit import fit, read_presses, repaired
+from dexsim_real.calibrate.press_fit import fit, read_presses
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 
 
@@ -183,17 +183,3 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     recording.shear = np.outer(sums, [0.0, 20.0])
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
         fit(*session, hand)
-
-
-def test_dead_taxels_are_those_among_pressed_ones(hand):
-    rng = np.random.default_rng(0)
-    lattice = np.zeros((50, 10, 12))
-    lattice[:, 2:8, 3:9] = rng.uniform(5, 20, (50, 6, 6))
-    whole = lattice.reshape(50, 120).copy()
-    lattice[:, 4, 5] = lattice[:, 6, 7] = 0.0
-    counts = lattice.reshape(50, 120)
-    filled, dead = repaired(hand, counts)
-    np.testing.assert_array_equal(np.flatnonzero(dead), [4 * 12 + 5, 6 * 12 + 7])
-    np.testing.assert_array_equal(filled[:, ~dead], counts[:, ~dead])
-    around = [3 * 12 + 4, 3 * 12 + 5, 3 * 12 + 6, 4 * 12 + 4, 4 * 12 + 6, 5 * 12 + 4, 5 * 12 + 5, 5 * 12 + 6]
-    np.testing.assert_allclose(filled[:, 4 * 12 + 5], whole[:, around].mean(1))
