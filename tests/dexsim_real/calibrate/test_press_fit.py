@@ -100,9 +100,8 @@ def test_a_press_is_taken_from_the_last_log_that_finished_it(hand, session, tmp_
             for entry in entries[:last]:
                 log.add(entry.kind, entry.content, entry.time)
     (_, alone), (source, cut) = (read_presses([path], hand) for path in (session[2], log.path))
-    for later in (tmp_path / "skipped", log.path):
-        both = read_presses([session[2], later], hand)[1]
-        assert [press.time.tolist() for press in both.values()] == [press.time.tolist() for press in alone.values()]
+    together = read_presses([session[2], tmp_path / "skipped", log.path], hand)[1]
+    assert [press.time.tolist() for press in together.values()] == [press.time.tolist() for press in alone.values()]
     assert not cut["index pad"].finished
     assert any(note.startswith("index pad: was interrupted") for note in fit(source, cut, hand)[0].notes)
     # One that was pressed again is the new one.

@@ -300,7 +300,7 @@ def test_another_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
     options = arguments(tmp_path, calibration=tmp_path / "known.toml", identify=True, log=tmp_path / "b.log")
     with pytest.raises(HandError, match="this is hand 2R32A, the calibration is of hand 2R32B"):
         bench_of(port, hand, options).__enter__()
-    assert port.closed and not port.commands
+    assert port.closed and not on(port).any()
 
 
 @pytest.mark.parametrize("stream", [io.StringIO(""), None], ids=["at its end", "closed"])
