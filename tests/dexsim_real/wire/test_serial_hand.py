@@ -165,31 +165,6 @@ def test_a_line_that_never_falls_silent_does_not_hold_the_driver(monkeypatch):
     assert port.exchange(command()) is None and clock.now - begin < 0.3
 
 
-def test_the_hand_goes_and_comes_back():
-    peer = PtyHand()
-    peer.open()
-    port = SerialHand(peer.port, QUICK)
-    port.connect()
-    assert port.exchange(command()).generation == 1
-    peer.close()
-    start = time.monotonic()
-    for _ in range(8):
-        assert port.exchange(command()) is None
-    assert port.counts.lost == 1
-    peer.commands.clear()
-    peer.open()
-    reply = None
-    while reply is None and time.monotonic() - start < 20:
-        reply = port.exchange(command())
-    # The first answer of the new generation is from a passive hand: its pose may have changed.
-    assert reply.generation > 1 and port.counts.reconnects == 1
-    assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
-    assert port.exchange(command()) is not None
-    np.testing.assert_array_equal(peer.commands[-1], command())
-    port.close()
-    peer.close()
-
-
 ERROR = Frame(0x80, 0xFE, Command.ERROR, b"\x02").encode()
 OTHER = Frame(0x81, 0xFE, Command.EXCHANGE, empty_state().tobytes()).encode()
 
@@ -322,7 +297,7 @@ def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
     loop.cycle()
     assert np.all(peer.commands[-1]["mode"] == Mode.POSITION)
     peer.close()
-    loop.cycle()
+    assert [loop.cycle() for _ in range(8)] == [None] * 8
     peer.commands.clear()
     peer.registers = {20: b"right", 21: back} if back else {}
     peer.open()
@@ -330,6 +305,9 @@ def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
     while time.monotonic() < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
         loop.cycle()
     driven = any(np.any(command["mode"] != Mode.PASSIVE) for command in peer.commands)
+    # The first answer of the new generation is from a passive hand: its pose may have changed.
+    assert not driven or not np.any(peer.commands[0]["mode"]) and loop.cycle().generation > 1
+    assert not driven or port.counts.lost == port.counts.reconnects == 1
     port.close()
     peer.close()
     assert driven == (not says) and len(peer.commands) > 1
