@@ -268,7 +268,7 @@ def test_a_finger_that_is_pushed_gives_way(hand):
 def test_short_holds_may_take_a_fifth_of_the_time(hand, share, ended):
     """A policy that touches too hard now and then goes on."""
     bench = ready(hand)
-    for k in range(round(52.0 / CYCLE)):
+    for k in range(round(42.0 / CYCLE)):
         bench.cycle(target=MIDDLE, force=30.0 * (k % 100 < share))
         if bench.safety.latched:
             break

@@ -49,8 +49,9 @@ def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
     return VirtualRun(plant, controller, 0.25), plant, controller
 
 
-def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
+def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypatch):
     """With one target that is too far away; an exchange begins every 12 ms, and its answer is there 9.6 ms later."""
+    monkeypatch.setattr("dexsim_real.twin.virtual._APPROACH", 1.0)
     far = 0.8 * (np.arange(12) == 4)
     run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
     update, heard = run.safety.update, []

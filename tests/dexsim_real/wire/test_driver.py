@@ -6,10 +6,9 @@ import dynamixel_bus
 import jax
 import numpy as np
 import pytest
-from driver_bench import DriverBench
 from dynamixel_bus import DynamixelBus, status
 from random_readings import random_readings
-from scripted_driver import ScriptedDriver
+from scripted_driver import DriverBench, ScriptedDriver
 from untrained import untrained
 
 from dexsim import load_hand
