@@ -14,7 +14,7 @@ from twin_plant import REST, ScriptedPlant
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
-from dexsim_real.twin.wire import OVERHEATED, Firmware, HandLine, Terminal
+from dexsim_real.twin.wire import OVERHEATED, SERIALS, Firmware, HandLine, Terminal
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
 from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, check_identity, read_identity
@@ -92,7 +92,7 @@ def test_each_hand_tells_its_side_and_is_refused_with_the_model_of_the_other(han
         board = Firmware(SimpleNamespace(hand=one))
         registers = (register.to_bytes(2, "little") for register in (SERIAL_NUMBER, SIDE))
         told = read_identity(*(ask(board, Command.READ_REGISTER, name).data[2:] for name in registers))
-        assert check_identity(told, one) == []
+        assert check_identity(told, one) == [] and told.serial_number == SERIALS[one.side]
         with pytest.raises(HandError, match=f"this is a {one.side} hand .* the model a {other.side} one: see --hand"):
             check_identity(told, other)
 

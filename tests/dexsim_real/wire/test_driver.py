@@ -198,6 +198,7 @@ def test_packets_are_those_of_the_manual():
     assert packet(1, 2, bytes([0x84, 0, 4, 0])) == bytes.fromhex("ff ff fd 00 01 07 00 02 84 00 04 00 1d 15")
     read = bytes([0x84, 0, 4, 0, 1, 2])
     assert packet(0xFE, 0x82, read) == bytes.fromhex("ff ff fd 00 fe 09 00 82 84 00 04 00 01 02 ce fa")
+    assert packet(1, 3, b"\xff\xff\xfd")[7:-2] == bytes.fromhex("03 ff ff fd fd"), "no header in a content"
     assert crc16(b"123456789") == dynamixel_bus.crc(b"123456789") == 0xFEE8
 
 
