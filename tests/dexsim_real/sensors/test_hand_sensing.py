@@ -252,15 +252,6 @@ def test_a_zero_that_has_moved_far_is_told_once(sensing):
     assert len(told) == 5 and all("its zero has moved by 3" in line for line in told)
 
 
-def test_a_residue_after_a_release_is_found(sensing):
-    """20 taxels that read one count after 8 N: a zero that jumped comes back within minutes, not never."""
-    residue, loaded = state(), state()
-    residue["tip"]["taxel"]["z"][1, 30:50] = 1
-    loaded["tip"]["taxel"]["z"][1, 30:50] = 4
-    follow(sensing, [loaded] * 40 + [residue] * 1160)
-    assert sensing.measure(residue).finger_force[1] <= 0.3
-
-
 @given(st.integers(0, 4), st.integers(1, 40), st.integers(1, 400), st.lists(st.integers(0, 119), min_size=1))
 def test_a_held_load_is_hidden_no_faster_than_zeros_wander(hand, finger, count, answers, taxels):
     """However light, long and spread a touch is: of 2 counts and 0.06 counts more each second."""

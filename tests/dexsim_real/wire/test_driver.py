@@ -122,8 +122,6 @@ def test_motors_count_as_off_only_when_the_hand_says_so(leap):
     ("measures", "observation", "says"),
     [
         (["currents"], {}, "observes 'contact_force', and the hand has no taxels"),
-        (["taxels"], {}, "observes 'joint_torque', and the hand has no currents"),
-        (["currents"], {"leave_out": ("contact_force", "contact_centre"), "add": ("finger_force",)}, "'finger_force'"),
         (
             [],
             {"leave_out": ("joint_torque", "contact_force", "contact_centre")},
