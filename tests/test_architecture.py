@@ -46,12 +46,12 @@ FLOORS = {
     "dexsim_real": (
         ("core",),
         ("wire",),
+        ("twin.plant",),
         ("sensors",),
         ("control",),
         ("loop",),
         ("run", "replay", "calibrate"),
         ("ros",),
-        ("twin.plant",),
         ("twin.wire",),
         ("twin",),
         ("",),
@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_570,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 20_195,  # goal: 18,000
+    "tests": 19_875,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
@@ -83,6 +83,8 @@ FOREIGN = {
     "dexsim_ppo.learner": ("dexsim.core",),
     "dexsim_ppo": ("dexsim",),
     "dexsim_real": ("dexsim", "dexsim_ppo"),
+    # Physics of its own: of training's it takes the type of a hand's model, its MJCF and the walk along its bodies.
+    "dexsim_real.twin.plant": tuple(f"dexsim.hand.{module}" for module in ("description", "kinematics", "mjcf")),
 }
 """What a package, or a room of it, may take from other packages."""
 

@@ -43,57 +43,40 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     again = replay.Replay(tmp_path / "run.log").report
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
-    drawn_by_finger(hand, tmp_path, ticks)
-    shown_in_rerun(hand, tmp_path, ticks)
-    taken_along(tmp_path, ticks)
+    drawn_and_taken_along(hand, tmp_path, ticks)
     forged(tmp_path)
     without_ticks(tmp_path)
 
 
-def shown_in_rerun(hand, folder, ticks):
-    """The signals and the whole observation."""
-    sent = []
+def drawn_and_taken_along(hand, folder, ticks):
+    """Figure by finger, signals and whole observation for rerun, and what each tick read as a dataset."""
+    shown, written, drawn = [], [], []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay, "show_rerun", lambda *parts: sent.append(parts))
-        assert replay.main([str(folder / "run.log"), "--rrd", str(folder / "run.rrd")]) == 0
-    ((_, times, series, taxels, path),) = sent
-    assert path == folder / "run.rrd" and len(times) == len(ticks) == len(taxels)
-    np.testing.assert_array_equal(series["angle"][1], [tick["readings"]["joint_position"] for tick in ticks])
+        patch.setattr(replay, "show_rerun", lambda *parts: shown.append(parts))
+        patch.setattr(replay, "check_lerobot", lambda path: None)
+        patch.setattr(replay, "write_lerobot", lambda *parts: written.append(parts))
+        patch.setattr("matplotlib.pyplot.close", drawn.append)
+        files = {option: str(folder / f"run.{option}") for option in ("rrd", "lerobot", "plot")}
+        files["plot"] += ".png"
+        assert replay.main([str(folder / "run.log"), *(f"--{option}={file}" for option, file in files.items())]) == 0
+    angles, targets = np.array([tick["readings"]["joint_position"] for tick in ticks]), [t["target"] for t in ticks]
+    ((_, times, series, taxels, path),) = shown
+    assert str(path) == files["rrd"] and len(times) == len(ticks) == len(taxels)
+    np.testing.assert_array_equal(series["angle"][1], angles)
     whole = np.concatenate([values for name, (_, values) in series.items() if "observation/" in name], 1)
     np.testing.assert_array_equal(whole, [tick["observation"] for tick in ticks])
     assert all(values.shape == (len(ticks), len(names)) for names, values in series.values())
-    assert series["target"][0] == hand.joint_names
-
-
-def taken_along(folder, ticks):
-    """As a dataset: what each tick read, and the target that followed."""
-    sent = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay, "check_lerobot", lambda path: None)
-        patch.setattr(replay, "write_lerobot", lambda *parts: sent.append(parts))
-        assert replay.main([str(folder / "run.log"), "--lerobot", str(folder / "data")]) == 0
-    ((path, _, task, (data,)),) = sent
-    assert path == folder / "data" and task == "grasp"
+    ((path, _, task, (data,)),) = written
+    assert str(path) == files["lerobot"] and task == "grasp"
     for name in ("joint_position", "taxel_force", "object_quat", "command"):
         np.testing.assert_array_equal(getattr(data, name), np.float32([tick["readings"][name] for tick in ticks]))
-    np.testing.assert_array_equal(data.target, np.float32([tick["target"] for tick in ticks]))
+    np.testing.assert_array_equal(data.target, np.float32(targets))
     assert data.time[0] == 0 and np.all(np.diff(data.time) > 0)
-
-
-def drawn_by_finger(hand, folder, ticks):
-    """The figure has one axis a finger, with each of its joints and its target."""
-    drawn = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("matplotlib.pyplot.close", drawn.append)
-        assert replay.main([str(folder / "run.log"), "--plot", str(folder / "run.png")]) == 0
-    assert (folder / "run.png").stat().st_size > 10_000
     axes = drawn[0].axes[:5]
     assert [axis.get_ylabel() for axis in axes] == [f"{name} [rad]" for name in hand.finger_names]
-    lines = [line for axis in axes for line in axis.lines]
-    for joint in range(12):
-        angles, targets = lines[2 * joint : 2 * joint + 2]
-        np.testing.assert_array_equal(angles.get_ydata(), [t["readings"]["joint_position"][joint] for t in ticks])
-        np.testing.assert_array_equal(targets.get_ydata(), [t["target"][joint] for t in ticks])
+    lines = np.array([line.get_ydata() for axis in axes for line in axis.lines])
+    np.testing.assert_array_equal(lines[0::2], angles.T)
+    np.testing.assert_array_equal(lines[1::2], np.transpose(targets))
 
 
 def rewritten(folder, change):

@@ -5,13 +5,11 @@ is across the finger on a block of foam, which yields along its normal and, more
 """
 
 import copy
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from dexsim_real.calibrate.procedure import Placement, placements
-from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
 from dexsim_real.wire.frames import Mode
@@ -46,21 +44,14 @@ class PressBench(EmulatedHand):
         """Force N of the pen on the foam along its normal, as a perfect scale under it shows."""
         return max(float(-self._spring @ self._facing), 0.0)
 
-    def results(self) -> list[dict[str, Any]]:
-        """True values of the hand (`truth`)."""
-        return [{"trial": 0, "seed": self.seed, "parameter_kind": self.kind, **self.truth()}]
-
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, list[float]]:
         """Values that a calibration should find: Nm per reported A (loading, unloading), taxel gains by finger."""
         parameters, drives = self.parameters, self._drives
         constant = drives.constant / parameters.current_gain
         loss = 1.0 - drives.efficiency
         return {
-            "joints": list(self.hand.joint_names),
             "loading_nm_per_a": (constant * (1 - loss)).tolist(),
             "unloading_nm_per_a": (constant * (1 + loss)).tolist(),
-            "friction_nm": np.asarray(drives.coulomb).tolist(),
-            "stall_a": STALL_CURRENT,
             "taxel_gain": parameters.taxel_gain.tolist(),
         }
 
@@ -146,10 +137,3 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([normal, y, np.cross(normal, y)], 1).ravel())
     return quat
-
-
-if __name__ == "__main__":  # The emulated hand's command, on the press bench.
-    from dexsim_real.twin import __main__ as command
-
-    command.make_plant = lambda arguments, hand: PressBench(hand, arguments.seed, arguments.parameters)
-    command.main()

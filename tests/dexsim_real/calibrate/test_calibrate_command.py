@@ -13,7 +13,7 @@ from dexsim.core.errors import DexsimError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.bench import PressConfig
-from dexsim_real.calibrate.press_fit import fit, read_presses
+from dexsim_real.calibrate.press_fit import read_presses
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
@@ -42,17 +42,19 @@ def test_options_that_do_not_go_together(tmp_path):
 
 
 def test_nothing_is_overwritten_and_a_figure_that_fails_leaves_the_calibration(hand, session, tmp_path, monkeypatch):
-    options, path, fitted = arguments(tmp_path), tmp_path / "hand.toml", fit(*read_presses([session[2]], hand), hand)
+    def fail(*_):
+        raise OSError("no figure")
+
+    options, path, known = arguments(tmp_path), tmp_path / "hand.toml", load_calibration(session[1].output, hand)
     monkeypatch.setattr(calibrate, "read_presses", lambda *_: ((), ()))
-    monkeypatch.setattr(calibrate, "fit", lambda *_: fitted)
+    monkeypatch.setattr(calibrate, "fit", lambda *_: (known, {}))
+    monkeypatch.setattr(calibrate, "plot_calibration", fail)
     path.write_text("precious")
     with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(session[2]))} fits these"):
         fit_and_report(options, hand, [session[2]], operator())  # It came while the hand was pressing.
     assert path.read_text() == "precious"
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
-        options = arguments(tmp_path, force=True, plot=tmp_path / "file" / "hand.png")
-        fit_and_report(options, hand, [session[2]], operator())
+    with pytest.raises(OSError, match="no figure"):
+        fit_and_report(arguments(tmp_path, force=True, plot=tmp_path / "hand.png"), hand, [session[2]], operator())
     assert load_calibration(path, hand).joint_names == hand.joint_names
 
 

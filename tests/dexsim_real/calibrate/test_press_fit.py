@@ -16,7 +16,7 @@ from dexsim.core.errors import CalibrationError
 from dexsim.touch.reduce import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.bench import CalibrateArguments
-from dexsim_real.calibrate.press_fit import fit, read_presses, repaired
+from dexsim_real.calibrate.press_fit import fit, read_presses
 from dexsim_real.core.log import Kind, LogReader, LogWriter
 
 
@@ -100,9 +100,8 @@ def test_a_press_is_taken_from_the_last_log_that_finished_it(hand, session, tmp_
             for entry in entries[:last]:
                 log.add(entry.kind, entry.content, entry.time)
     (_, alone), (source, cut) = (read_presses([path], hand) for path in (session[2], log.path))
-    for later in (tmp_path / "skipped", log.path):
-        both = read_presses([session[2], later], hand)[1]
-        assert [press.time.tolist() for press in both.values()] == [press.time.tolist() for press in alone.values()]
+    together = read_presses([session[2], tmp_path / "skipped", log.path], hand)[1]
+    assert [press.time.tolist() for press in together.values()] == [press.time.tolist() for press in alone.values()]
     assert not cut["index pad"].finished
     assert any(note.startswith("index pad: was interrupted") for note in fit(source, cut, hand)[0].notes)
     # One that was pressed again is the new one.
@@ -183,17 +182,3 @@ def test_a_joint_that_shear_loads_is_left_out(hand, scale):
     recording.shear = np.outer(sums, [0.0, 20.0])
     with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
         fit(*session, hand)
-
-
-def test_dead_taxels_are_those_among_pressed_ones(hand):
-    rng = np.random.default_rng(0)
-    lattice = np.zeros((50, 10, 12))
-    lattice[:, 2:8, 3:9] = rng.uniform(5, 20, (50, 6, 6))
-    whole = lattice.reshape(50, 120).copy()
-    lattice[:, 4, 5] = lattice[:, 6, 7] = 0.0
-    counts = lattice.reshape(50, 120)
-    filled, dead = repaired(hand, counts)
-    np.testing.assert_array_equal(np.flatnonzero(dead), [4 * 12 + 5, 6 * 12 + 7])
-    np.testing.assert_array_equal(filled[:, ~dead], counts[:, ~dead])
-    around = [3 * 12 + 4, 3 * 12 + 5, 3 * 12 + 6, 4 * 12 + 4, 4 * 12 + 6, 5 * 12 + 4, 5 * 12 + 5, 5 * 12 + 6]
-    np.testing.assert_allclose(filled[:, 4 * 12 + 5], whole[:, around].mean(1))

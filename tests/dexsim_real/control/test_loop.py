@@ -63,16 +63,6 @@ def run(loop, cycles):
     return reactions
 
 
-def test_a_hand_that_refuses_for_heat_is_turned_off_with_its_own_words(loop):
-    hot = read_refusal((1501028).to_bytes(4, "little"))
-    run(loop, AGREEING)
-    loop.engage()
-    loop.port.plan = ["state"] * 5 + [hot, "state", hot, None, hot]
-    reactions = run(loop, 20)
-    assert loop.safety.latched == "the hand reports over-temperature (1501028)"
-    assert [reaction == Reaction.RELAX for reaction, _ in reactions] == [False] * 10 + [True] * 10
-
-
 def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(loop):
     """Silent first, then busy: the silence counts from its beginning."""
     run(loop, AGREEING)

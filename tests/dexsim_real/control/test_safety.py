@@ -90,8 +90,9 @@ def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
     bench.position = MIDDLE - np.float32(0.3) * FREE
     assert bench.cycle(fresh=False).mode == bench.cycle(target=MIDDLE).mode == Mode.PASSIVE, "not engaged"
     bench.engage()
+    assert bench.safety.anchor == 0
     first = bench.cycle(follow=False)
-    assert first.mode == Mode.POSITION
+    assert first.mode == Mode.POSITION and bench.safety.anchor == 1
     np.testing.assert_allclose(first.position, bench.position, atol=2e-7)
     path = np.array([first.position] + [d.position for d in bench.run(2.0, target=MIDDLE + np.float32(0.15))])
     speed = np.abs(np.diff(path, axis=0)).max(1) / CYCLE

@@ -268,7 +268,7 @@ def test_a_finger_that_is_pushed_gives_way(hand):
 def test_short_holds_may_take_a_fifth_of_the_time(hand, share, ended):
     """A policy that touches too hard now and then goes on."""
     bench = ready(hand)
-    for k in range(round(52.0 / CYCLE)):
+    for k in range(round(42.0 / CYCLE)):
         bench.cycle(target=MIDDLE, force=30.0 * (k % 100 < share))
         if bench.safety.latched:
             break
@@ -400,13 +400,11 @@ def soak(hand, minutes, share, speed, seed=0):
     return port, starts, ends
 
 
-@pytest.mark.parametrize(
-    ("speed", "minutes", "least"),
-    [(7.0, 0.5, 100), pytest.param(2.0, 30, 10_000, marks=pytest.mark.slow)],
-)
-def test_no_wrong_reading_moves_a_joint_faster_than_its_limit(hand, speed, minutes, least):
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed", "minutes"), [(7.0, 5), (2.0, 30)])
+def test_no_wrong_reading_moves_a_joint_faster_than_its_limit(hand, speed, minutes):
     port, starts, ends = soak(hand, minutes, 0.018, speed)
-    assert port.wrong >= least and min(port.reconnections, starts) >= 2 * minutes, ends
+    assert port.wrong >= 200 * minutes and min(port.reconnections, starts) >= 2 * minutes, ends
     assert port.cycles_on > 0.5 * port.cycles
     assert port.step_of_starts <= SLOW * CYCLE
     assert port.step <= speed * CYCLE * 1.05

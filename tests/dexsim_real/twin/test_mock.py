@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from calibrating import arguments, operator
-from driver_bench import DriverBench
+from scripted_driver import DriverBench
 from untrained import untrained
 
 from dexsim import load_hand
@@ -29,8 +29,8 @@ def test_an_object_that_is_let_go_over_the_hand_is_felt():
     bench = bench_of("leap_like")
     bench.engage()
     posture = np.array(bench.hand.grasp_posture)
-    bench.run(3.0, posture)
-    bench.run(2.0, posture + 0.6)
+    bench.run(1.5, posture)
+    bench.run(1.2, posture + 0.6)
     assert bench.safety.sample.measured.finger_force.max() > 1.0 and not bench.safety.latched
 
 

@@ -10,12 +10,15 @@ from emulated_plant import free
 from dexsim.calibration.maps import normalised_torque
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Tick
+from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import SHAPES, product
 from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera, virtual_imu
+from dexsim_real.twin.wire import picture
 
+OPTICS = CameraConfig()
 CALM = {"camera_noise": 0.0, "camera_delay": 0.0, "push_rate": 0.0, "heading_error": 0.0, "place_error": 0.0}
 
 
@@ -46,8 +49,9 @@ def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
     return VirtualRun(plant, controller, 0.25), plant, controller
 
 
-def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
+def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypatch):
     """With one target that is too far away; an exchange begins every 12 ms, and its answer is there 9.6 ms later."""
+    monkeypatch.setattr("dexsim_real.twin.virtual._APPROACH", 1.0)
     far = 0.8 * (np.arange(12) == 4)
     run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
     update, heard = run.safety.update, []
@@ -96,6 +100,9 @@ def test_the_camera_measures_the_height(hand):
         port.sleep(0.002)
         _, position, _ = camera.read()
         assert position[1:] == pytest.approx(reference[1:])
+        if shape == "sphere":  # Its outline by a pinhole: a cone of half angle asin(r / d), nearly a circle.
+            radius = 600 * math.tan(math.asin(plant.shape.parts[0].size[0] / math.dist(OPTICS.position, position)))
+            assert picture(plant, OPTICS).sum() == pytest.approx(math.pi * radius**2, rel=0.03)
         # A composition's outline has another middle than the composition.
         assert position[0] == pytest.approx(reference[0] + 0.01, abs=0.001 if shape != "composition" else 0.006)
 
