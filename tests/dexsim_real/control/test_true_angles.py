@@ -400,11 +400,13 @@ def soak(hand, minutes, share, speed, seed=0):
     return port, starts, ends
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("speed", "minutes"), [(7.0, 5), (2.0, 30)])
-def test_no_wrong_reading_moves_a_joint_faster_than_its_limit(hand, speed, minutes):
+@pytest.mark.parametrize(
+    ("speed", "minutes", "least"),
+    [(7.0, 0.5, 100), pytest.param(2.0, 30, 10_000, marks=pytest.mark.slow)],
+)
+def test_no_wrong_reading_moves_a_joint_faster_than_its_limit(hand, speed, minutes, least):
     port, starts, ends = soak(hand, minutes, 0.018, speed)
-    assert port.wrong >= 200 * minutes and min(port.reconnections, starts) >= 2 * minutes, ends
+    assert port.wrong >= least and min(port.reconnections, starts) >= 2 * minutes, ends
     assert port.cycles_on > 0.5 * port.cycles
     assert port.step_of_starts <= SLOW * CYCLE
     assert port.step <= speed * CYCLE * 1.05
