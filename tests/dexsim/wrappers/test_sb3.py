@@ -28,20 +28,3 @@ def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_terminati
             limits[i].add(infos[i]["TimeLimit.truncated"])
             assert np.any(infos[i]["terminal_observation"] != seen[i])
     assert limits == {0: {False}, 1: {True}}
-
-
-@pytest.mark.slow
-def test_its_ppo_learns():
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.evaluation import evaluate_policy
-    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
-
-    from dexsim.wrappers.sb3 import SB3VecEnv
-
-    env = VecNormalize(VecMonitor(SB3VecEnv(TinyEnv(), 32)), gamma=0.95)
-    model = PPO("MlpPolicy", env, n_steps=32, batch_size=256, gamma=0.95, learning_rate=3e-3, seed=0, device="cpu")
-    before, _ = evaluate_policy(model, env, 64)
-    model.learn(25 * 1024)
-    env.training, env.norm_reward = False, False
-    after, _ = evaluate_policy(model, env, 64)
-    assert before < 20 < 28 < after, "of 31.2 at best"
