@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_570,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 20_195,  # goal: 18,000
+    "tests": 19_340,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
@@ -177,30 +177,10 @@ def test_packages_take_from_others_only_what_they_may():
     assert wrong == []
 
 
-def test_no_module_is_in_a_circle():
-    state: dict[str, int] = {}
-
-    def visit(module: str, path: tuple[str, ...]) -> None:
-        state[module] = 1
-        for other in sorted(imports(module)):
-            assert state.get(other) != 1 or other == module, f"circle: {' -> '.join((*path, module, other))}"
-            if other not in state:
-                visit(other, (*path, module))
-        state[module] = 2
-
-    for module in modules():
-        if module not in state:
-            visit(module, ())
-
-
-def lines(*folders: str) -> int:
-    """Lines of Python in these folders, and of the files that are named."""
-    paths = [path for folder in folders for path in ((ROOT / folder).rglob("*.py"))]
-    return sum(len(path.read_text().splitlines()) for path in {*paths, *map(ROOT.joinpath, folders)} if path.is_file())
-
-
 @pytest.mark.parametrize("place", BUDGETS)
 def test_folders_keep_their_budget(place):
     """A thing that needs more lines says what it gives up, or takes them from elsewhere."""
-    folders = [f"dexsim/{path.name}" for path in (ROOT / "dexsim").glob("*.py")] if place == ROOTS else place.split()
-    assert lines(*folders) <= BUDGETS[place]
+    paths = (ROOT / "dexsim").glob("*.py")
+    if place != ROOTS:
+        paths = [path for folder in place.split() for path in (ROOT / folder).rglob("*.py")]
+    assert sum(len(path.read_text().splitlines()) for path in paths) <= BUDGETS[place]
