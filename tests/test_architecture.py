@@ -1,4 +1,4 @@
-"""The map of the house, read from the sources: floors, circles, sizes, and what each package may import.
+"""The map of the house, read from the sources: floors, sizes, and what each package may import.
 
 A room is a folder of a package; a module at a package's root is a room of its own.
 """
@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_570,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 19_340,  # goal: 18,000
+    "tests": 19_335,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

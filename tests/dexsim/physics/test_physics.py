@@ -1,4 +1,4 @@
-"""Choosing an engine; a guard that names what the physics would drop; private names of MJX."""
+"""Choosing an engine; a guard that names what the physics would drop."""
 
 import types
 

@@ -1,4 +1,4 @@
-"""The brax adapter, against the installed brax: its wrappers and its PPO."""
+"""The brax adapter, against the installed brax's wrappers."""
 
 import jax
 import jax.numpy as jnp

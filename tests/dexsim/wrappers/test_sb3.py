@@ -1,17 +1,12 @@
-"""The vector environment of Stable-Baselines3: its conventions at an episode's end, and its PPO on it."""
+"""The vector environment of Stable-Baselines3: its conventions at an episode's end."""
 
 import numpy as np
 import pytest
 from tiny_env import TinyConfig, TinyEnv
 
 
-@pytest.fixture(autouse=True)
-def sb3():
-    """Loads torch, for seconds."""
-    pytest.importorskip("stable_baselines3")
-
-
 def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_termination():
+    pytest.importorskip("stable_baselines3")  # loads torch, for seconds
     from dexsim.wrappers.sb3 import SB3VecEnv
 
     # The first environment runs off the field, the second stays on it until the time limit.
