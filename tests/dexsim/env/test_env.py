@@ -257,10 +257,10 @@ class TestEpisodes:
     def test_an_object_is_held_until_it_is_let_go(self, grasp_env, grasp_rollout):
         """For 0.1 s, four ticks; then it falls freely."""
         state = grasp_rollout.reset(jax.random.key(3))
-        aside = state.physics.qpos.at[:, 13].add(1.0)
+        aside, moving = state.physics.qpos.at[:, 13].add(1.0), state.physics.qvel.at[:, 12].set(0.1)
         state = dataclasses.replace(
             state,
-            physics=dataclasses.replace(state.physics, qpos=aside),
+            physics=dataclasses.replace(state.physics, qpos=aside, qvel=moving),
             goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1)),
         )
         heights, still = [], state.key
