@@ -36,7 +36,7 @@ _ENV = "tests/dexsim/env tests/dexsim/tasks"
 TESTS = {
     "dexsim_real/control": f"tests/dexsim_real/control {_RUN}",
     "dexsim_real/sensors": f"tests/dexsim_real/sensors tests/dexsim_real/control {_RUN}",
-    "dexsim_ppo/learner": "tests/dexsim_ppo/learner tests/dexsim_ppo/training tests/dexsim_ppo/test_physics_step.py",
+    "dexsim_ppo/learner": "tests/dexsim_ppo/learner tests/dexsim_ppo/training",
     "dexsim/env": "tests/dexsim/env tests/dexsim/tasks tests/dexsim/test_randomization.py",
     "dexsim/tasks": "tests/dexsim/tasks tests/dexsim/env tests/dexsim_ppo/test_evaluator.py",
     "dexsim/touch": f"tests/dexsim/touch {_ENV}",

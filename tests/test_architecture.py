@@ -61,8 +61,8 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 14_565,  # goal: 12,500
-    "dexsim/core": 850,  # goal: 900
+    "dexsim": 14_570,  # goal: 12,500
+    "dexsim/core": 855,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_265,  # goal: 1,900
     "dexsim/hand dexsim/objects": 2_610,  # goal: 1,900
     "dexsim/physics": 2_345,  # goal: 2,200, and 1,300 of CUDA
@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_570,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 19_875,  # goal: 18,000
+    "tests": 19_185,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -51,13 +51,12 @@ def test_help_starts_no_device():
     assert child.returncode == 0 and child.stdout.startswith("usage: "), child.stderr
 
 
-TRAIN = TrainArguments[GraspConfig], preset_arguments("grasp", GraspConfig(), "cpu")
-
-
 def test_a_misspelt_option_is_refused_and_the_right_one_named(capsys):
-    cls, default = TRAIN
+    default = preset_arguments("grasp", GraspConfig(), "cpu")
     with pytest.raises(SystemExit) as stop:
-        cli.parse(cls, ["--env.push-probabilty", "1"], prog="x", description="", default=default)
+        cli.parse(
+            TrainArguments[GraspConfig], ["--env.push-probabilty", "1"], prog="x", description="", default=default
+        )
     assert stop.value.code == 2 and "--env.push-probability" in capsys.readouterr().err
 
 

@@ -122,9 +122,6 @@ def test_anchors_exist():
             assert anchor in headings, f"{name_of(page)}: {link}#{anchor}"
 
 
-# --- numbers --------------------------------------------------------------------------------------------
-
-
 def numbers(text: str) -> set[float]:
     return {float(found.replace(",", "")) for found in re.findall(r"\d[\d,]*\.?\d*", text)}
 

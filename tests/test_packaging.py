@@ -11,45 +11,27 @@ import pytest
 from paths import ROOT
 
 PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
-in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs a checkout")
+if not (ROOT / "pyproject.toml").exists():
+    pytest.skip("needs a checkout", allow_module_level=True)
 
 
-def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
-    """Run `code` in a fresh interpreter, with `path` in front of everything importable."""
-    start = f"import sys; sys.path.insert(0, {str(path)!r})\n" if path else ""
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", start + code], cwd=cwd, capture_output=True, text=True, timeout=300
-    )
+def run(*command: object, cwd: Path = ROOT) -> str:
+    done = subprocess.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-@in_checkout
 def test_links_lead_somewhere():
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")):
         links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
         assert not [link for link in links if "://" not in link and not (page.parent / link).exists()], page
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """The wheel, built from this checkout without fetching anything."""
-    if not (ROOT / "pyproject.toml").exists():
-        pytest.skip("needs a checkout")
-    out = tmp_path_factory.mktemp("wheel")
-    subprocess.run(
-        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)],
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    (built,) = out.glob("*.whl")
-    return built
-
-
 @pytest.mark.slow
-def test_the_wheel_is_whole_and_works_from_another_directory(wheel, tmp_path):
+def test_the_wheel_is_whole_and_works_from_another_directory(tmp_path):
+    """Built and installed without fetching anything."""
+    run("-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, ROOT)
+    (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     shipped = {name.removeprefix("dexsim/_assets/") for name in names if name.startswith("dexsim/_assets/")}
@@ -60,16 +42,16 @@ def test_the_wheel_is_whole_and_works_from_another_directory(wheel, tmp_path):
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == set(PACKAGES)
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
-    subprocess.run([*install, str(wheel)], check=True, capture_output=True, timeout=300)
-    code = """
+    run("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", site, wheel)
+    code = f"import sys; sys.path.insert(0, {str(site)!r})"
+    code += """
 import dexsim, dexsim_ppo, dexsim_real
 from dexsim.core.assets import asset_path
 from dexsim.hand.load import load_hand
 load_hand()
 print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)), asset_path("hand/xhand_right.xml"))
 """
-    files = run_python(code, elsewhere, site).split()
+    files = run("-P", "-c", code, cwd=elsewhere).split()
     assert len(files) == 4 and all(Path(name).is_relative_to(site) for name in files), files
 
 
@@ -85,7 +67,6 @@ def test_no_text_sends_people_to_the_name_of_another_project():
     assert wrong == ["pyproject.toml"], "there extras name `train`"
 
 
-@in_checkout
 def test_the_distribution_has_the_name_that_messages_give():
     from dexsim.core.install import DISTRIBUTION, install_line
 

@@ -44,9 +44,6 @@ def stub(paper, **changes):
     return paper.data.Experiment(rows=rows, measure=measure, **given | changes), calls
 
 
-# --- everything, tiny -----------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["readings", "all"])
 def test_smoke(paper, here, capsys, name):
@@ -67,9 +64,6 @@ def test_smoke(paper, here, capsys, name):
     assert "0 of 1 seeds" not in capsys.readouterr().out
 
 
-# --- rows and seeds that are done -----------------------------------------------------------------------
-
-
 def test_rows_and_seeds_go_on_where_they_stopped(paper, here):
     experiment, calls = stub(paper)
     measure = experiment.measure
@@ -87,9 +81,6 @@ def test_rows_and_seeds_go_on_where_they_stopped(paper, here):
     assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
     report = json.loads((here / "stub" / "b" / "report.json").read_text())
     assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
-
-
-# --- what the rows are ----------------------------------------------------------------------------------
 
 
 def test_settings_of_all_rows_are_of_their_tasks(paper):
@@ -112,9 +103,6 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
             if row.ablate:
                 load_policy(row.policy).ablate(*row.ablate)
     assert len(paper.experiments.EXPERIMENTS["observations"].rows) == 7
-
-
-# --- tables ---------------------------------------------------------------------------------------------
 
 
 def test_committed_tables_agree_with_the_reports(paper):

@@ -36,9 +36,6 @@ def test_json_has_options_metrics_and_trials(zero_shot, tmp_path, monkeypatch, c
     assert found["options"]["limit"] == {"speed": 20.0} and "held" in capsys.readouterr().out
 
 
-# --- metrics and tables --------------------------------------------------------------------------------
-
-
 def test_metrics_of_rotations(zero_shot):
     keys = ("successes", "paper_successes", "seconds_to_fall", "fell", "joint_speed")
     rows = ((0, 1, 3.0, True, 0.5), (10, 11, 60.0, True, 0.5), (50, 51, 120.0, False, 0.5))

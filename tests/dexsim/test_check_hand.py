@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,43 +43,28 @@ def test_a_link_that_is_elsewhere_or_turned_is_named(folder, says):
     assert re.search(f"right_hand_pinky_link2.* {says}", check_hand.check_kinematics(hand))
 
 
-def scaled(factor):
-    """Positions of another unit."""
-    return lambda line: [*line[:3], *(f"{factor * float(x):.6g}" for x in line[3:6]), *line[6:]]
-
-
-def lifted(line):
-    """Positions in a frame whose origin is elsewhere."""
-    return [*line[:5], f"{float(line[5]) + 0.18:.6g}", *line[6:]]
-
-
-def inward(line):
-    return [*line[:6], *(f"{-float(x):.6g}" for x in line[6:9]), line[9]]
-
-
-def sunk(line):
-    """One taxel of the index finger, 4 mm below its skin."""
-    if line[:3] != ["index", "1", "5"]:
-        return line
-    place = [float(x) - 0.004 * float(normal) for x, normal in zip(line[3:6], line[6:9], strict=True)]
-    return [*line[:3], *(f"{x:.6g}" for x in place), *line[6:]]
-
-
-# What is changed in each line of the taxel file, and what is said of it.
+# What is changed of the taxels' positions and normals, and what is said of it.
+ONE = np.zeros((5, 120, 1), np.float32)
+ONE[1, 17] = 1  # of the index finger
 MISPLACED = {
-    "sunk": (sunk, r"^finger 'index': taxel column 1, row 5 lies [34](\.\d)? mm inside its link \(1 of 120\)$"),
-    "millimetres": (scaled(1e3), "mm away from its link: metres, in"),
-    "frame": (lifted, "'thumb': taxel .* mm away from its link"),
-    "normals": (inward, "faces into its link: .*120 of 120"),
+    "sunk": (
+        lambda place, normal: (place - 0.004 * ONE * normal, normal),
+        r"^finger 'index': taxel column 1, row 5 lies [34](\.\d)? mm inside its link \(1 of 120\)$",
+    ),
+    "millimetres": (lambda place, normal: (1e3 * place, normal), "mm away from its link: metres, in"),
+    "frame": (
+        lambda place, normal: (place + np.float32([0, 0, 0.18]), normal),
+        "'thumb': taxel .* mm away from its link",
+    ),
+    "normals": (lambda place, normal: (place, -normal), "faces into its link: .*120 of 120"),
 }
 
 
 @pytest.mark.parametrize("name", MISPLACED)
-def test_taxels_that_are_off_the_skin_are_named(name, folder):
+def test_taxels_that_are_off_the_skin_are_named(hand, name):
     change, said = MISPLACED[name]
-    head, *lines = (folder / "taxels.csv").read_text().splitlines()
-    (folder / "taxels.csv").write_text("\n".join([head, *(",".join(change(line.split(","))) for line in lines)]))
-    assert re.search(said, check_hand.check_taxels(load_hand(folder / "xhand_right.toml")))
+    place, normal = change(hand.taxel_position, hand.taxel_normal)
+    assert re.search(said, check_hand.check_taxels(replace(hand, taxel_position=place, taxel_normal=normal)))
 
 
 def test_a_hand_that_nothing_can_touch_gets_its_whole_report(folder, capsys):
@@ -129,11 +115,7 @@ WRONG = {
         check_hand.check_signs,
         "positive angles open thumb_mcp.*index_mcp.*negate",
     ),
-    "no grasp": (
-        {r"(?s)\[grasp\].*?(?=\[\[)": ""},
-        check_hand.check_reach,
-        "'leap_like' has no grasp: its TOML needs",
-    ),
+    "no grasp": ({r"(?s)\[grasp\].*?(?=\[\[)": ""}, check_hand.check_reach, "'leap_like' has no grasp: its TOML needs"),
     "stretched": ({r"posture = \[.*\]": f"posture = {[0.0] * 16}"}, check_hand.check_reach, FAR),
     "behind": ({r"centre = \[.*\]": "centre = [0, 0, -0.30]"}, check_hand.check_reach, FAR),
     "closed": (

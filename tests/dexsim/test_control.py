@@ -100,18 +100,13 @@ def test_it_rests_at_its_limit_or_at_the_ends_of_what_a_policy_is_shown(command,
         assert abs(steps[1]) == pytest.approx(1.0 * PERIOD, rel=1e-5), "no faster, and as fast as allowed"
 
 
-def with_gains(hand, newton):
-    """The hand whose fingers press with so many N with their root joints at the torque limit."""
-    gain = np.float32(newton) / hand.torque_limit[hand.root_joint]
-    return dataclasses.replace(hand, force_per_torque=gain)
-
-
 def test_an_estimate_is_the_taxels_and_a_share_of_what_the_torque_adds_and_zero_without_touch(hand):
     taxels = np.zeros((5, hand.num_taxels), np.float32)
     taxels[:, 3] = [2.0, 0.5, 0.0, 6.0, 0.05]
     torque = np.zeros(12, np.float32)
     torque[hand.root_joint] = [0.1, -0.2, 0.3, 0.1, 0.4]
-    calibrated = with_gains(hand, (8.0, 15.0, 13.0, 14.0, 15.0))
+    gain = np.float32([8.0, 15.0, 13.0, 14.0, 15.0]) / hand.torque_limit[hand.root_joint]
+    calibrated = dataclasses.replace(hand, force_per_torque=gain)
     for share, second in ((1.0, 3.0), (0.5, 1.75), (0.0, 0.5)):
         found = estimate_force(ForceEstimate(torque_share=share), calibrated, taxels, torque)
         np.testing.assert_allclose(found, [2.0, second, 0.0, 6.0, 0.0], rtol=1e-6)

@@ -131,9 +131,6 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
     assert 0.25 < np.mean(corners) < 0.35
 
 
-# --- refusals ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("values", "word"),
     [

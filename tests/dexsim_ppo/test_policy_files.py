@@ -87,9 +87,6 @@ def test_load_names_what_is_wrong(file, tmp_path):
             checkpoint.load(path, **options)
 
 
-# --- policies -------------------------------------------------------------------------------------------
-
-
 def test_policy_round_trip(policy, tmp_path):
     policy.save(tmp_path / "p.msgpack")
     loaded = load_policy(tmp_path / "p.msgpack")

@@ -11,28 +11,17 @@ from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy, record
 
 
-@pytest.fixture(scope="module")
-def env():
-    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
-
-
-@pytest.fixture(scope="module")
-def compiled(env):
-    """The first states of the three episodes, and the step."""
-    protocol = evaluation_of(env)
-    starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(3, 0))
-    return starts, jit(jax.vmap(env.step), once=True)
-
-
 @pytest.mark.slow
-def test_readings_and_targets_are_those_of_the_episodes(env, compiled):
-    policy = load_policy("grasp")
+def test_readings_and_targets_are_those_of_the_episodes():
+    env, policy = dexsim.make("grasp", GraspConfig(pool_size=80), backend="c"), load_policy("grasp")
     found, shown = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
     for one, snapshots in zip(found, shown, strict=True):
         np.testing.assert_allclose(snapshots.taxel_force, one.taxel_force)
         assert snapshots.primitive_active.shape == (10, len(env.primitive_kinds))
-    (state, step), memory = compiled, policy.initial_carry(3)
+    protocol, memory = evaluation_of(env), policy.initial_carry(3)
+    state = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(3, 0))
+    step = jit(jax.vmap(env.step), once=True)
     for tick in range(10):
         for i, one in enumerate(found):
             for name in ("joint_position", "taxel_force", "command"):

@@ -92,9 +92,6 @@ def test_a_delay_within_a_substep_is_the_mean_over_it():
     np.testing.assert_allclose(acts, [-1.0, 0.5, 1.0])
 
 
-# --- ripple, encoder, friction ----------------------------------------------------------------------
-
-
 def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velocity=0.0, steps=1000):
     """Velocities of a joint with nothing but friction, semi-implicit as the physics."""
     rubbing = motor(coulomb_friction=coulomb, viscous_friction=viscous)
@@ -135,9 +132,6 @@ def test_friction_is_c_mujocos(coulomb, viscous):
     np.testing.assert_allclose(np.cumsum(speed) * 5e-4, reference[:, 0], atol=2e-3)
     if coulomb:
         assert np.mean(speed == 0) > 0.02
-
-
-# --- every parameter is a leaf -------------------------------------------------------------------
 
 
 def test_a_drive_is_at_its_limit_where_it_gives_less_than_its_loop_asks_for():

@@ -69,9 +69,6 @@ def test_a_wrong_value_is_named_with_its_range_in_code_and_in_a_file(fields, exp
     assert message(from_dict, Chair, {"legs": 4, "seat": fields}) == expected
 
 
-# --- dictionaries ------------------------------------------------------------------------------------
-
-
 @given(
     st.floats(0.5, 8.0),
     st.integers(1, 99),

@@ -119,9 +119,6 @@ def test_a_dataset_that_fails_leaves_nothing(hand, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir()) and len(names) == 1 and names[0].startswith(".new.")
 
 
-# --- pictures, and LeRobot's own policies ---------------------------------------------------------------
-
-
 def pictures(ticks):
     """Flat pictures [T], each a little brighter than the one before."""
     files = []
@@ -148,9 +145,6 @@ def test_pictures_are_read_back_with_their_shape_and_statistics(filmed):
         np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(row["bytes"])))[5, 7], (t, 2 * t, 255))
     np.testing.assert_allclose(stats[name]["max"], np.reshape([30, 60, 255], (3, 1, 1)) / 255)
     assert np.shape(stats[name]["mean"]) == (3, 1, 1) and stats[name]["count"] == [20]
-
-
-# --- episodes for the live view -------------------------------------------------------------------------
 
 
 def test_episodes_are_read_back_as_they_were_written(tmp_path):

@@ -42,20 +42,6 @@ def assert_same(first, second, rows=slice(None)):
         np.testing.assert_array_equal(ours[path][rows], theirs[path][rows], err_msg=path)
 
 
-def placed(rollout, seed, qpos, qvel, object, joint_target=None):
-    """A reset batch with its hands and objects put elsewhere."""
-    state = rollout.reset(jax.random.key(seed))
-    qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-    state = with_episode(
-        state, object=jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), object, state.episode.object)
-    )
-    return dataclasses.replace(
-        state,
-        physics=PhysicsState(qpos, qvel, jnp.zeros((WORLDS, 18))),
-        joint_target=qpos[:, :12] if joint_target is None else jnp.asarray(joint_target, jnp.float32),
-    )
-
-
 def actions(seed, scale=1.0):
     return jnp.asarray(np.random.default_rng(seed).uniform(-scale, scale, (WORLDS, 12)), jnp.float32)
 
@@ -72,20 +58,12 @@ def history(grasp_rollout):
     return ticks
 
 
-class TestPure:
-    def test_same_inputs_same_outputs_and_worlds_do_not_mix(self, grasp_rollout, history):
-        """A permuted batch gives permuted results, bit for bit."""
-        state, action, following = history[6]
-        assert_same(grasp_rollout.step(state, action), following)
-        order = np.array([3, 1, 7, 0, 5, 2, 6, 4])
-        assert_same(grasp_rollout.step(row(state, order), action[order]), row(following, order))
-
-    def test_reset_depends_on_the_key_alone(self, grasp_rollout):
-        first, again, other = (grasp_rollout.reset(jax.random.key(seed)) for seed in (1, 1, 2))
-        assert_same(first, again)
-        assert not np.array_equal(first.physics.qpos, other.physics.qpos)
-        assert not np.array_equal(first.episode.hand.encoder_bias, other.episode.hand.encoder_bias)
-        assert len(np.unique(first.episode.hand.encoder_bias[:, 0])) == WORLDS
+def test_same_inputs_same_outputs_and_worlds_do_not_mix(grasp_rollout, history):
+    """A permuted batch gives permuted results, bit for bit."""
+    state, action, following = history[6]
+    assert_same(grasp_rollout.step(state, action), following)
+    order = np.array([3, 1, 7, 0, 5, 2, 6, 4])
+    assert_same(grasp_rollout.step(row(state, order), action[order]), row(following, order))
 
 
 class TestTick:
@@ -99,7 +77,9 @@ class TestTick:
         pool, config = grasp_env.pool, grasp_env.config
         rows = np.concatenate([c_scene.rows_of(pool, shape)[:4] for shape in ("sphere", "capsule")])
         starts = c_scene.row(pool, rows)
-        state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.object)
+        state = with_episode(grasp_rollout.reset(jax.random.key(11)), object=starts.object)
+        physics = PhysicsState(starts.qpos, starts.qvel, jnp.zeros((WORLDS, 18)))
+        state = dataclasses.replace(state, physics=physics, joint_target=jnp.asarray(starts.qpos[:, :12]))
         for _ in range(8):
             state = grasp_rollout.step(state, np.tile(np.float32(np.arange(12) > 3), (WORLDS, 1)))
         action = actions(3)
@@ -172,11 +152,7 @@ class TestTick:
         after = grasp_rollout.step(state, 3.0 * jnp.sign(actions(5)))
         np.testing.assert_array_equal(after.readings.last_action, after.action)
         assert_same(after, grasp_rollout.step(state, jnp.sign(actions(5))))
-        assert np.abs(after.action).max() == 1.0
-        moved = np.asarray(after.joint_target - state.joint_target)
-        measured = np.asarray(state.physics.qpos[:, :12])
-        assert np.all(np.abs(np.asarray(after.joint_target) - measured) <= 0.5 + 1e-6)
-        assert np.abs(moved).max() > 0.1
+        assert np.abs(after.action).max() == 1.0 and np.abs(after.joint_target - state.joint_target).max() > 0.1
 
 
 def plain_drive(drive, wanted, position, velocity):
@@ -281,53 +257,53 @@ class TestEpisodes:
     def test_an_object_is_held_until_it_is_let_go(self, grasp_env, grasp_rollout):
         """For 0.1 s, four ticks; then it falls freely."""
         state = grasp_rollout.reset(jax.random.key(3))
-        aside = state.physics.qpos.at[:, 13].add(1.0)
+        aside, moving = state.physics.qpos.at[:, 13].add(1.0), state.physics.qvel.at[:, 12].set(0.1)
         state = dataclasses.replace(
             state,
-            physics=dataclasses.replace(state.physics, qpos=aside),
+            physics=dataclasses.replace(state.physics, qpos=aside, qvel=moving),
             goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1)),
         )
         heights, still = [], state.key
         for _ in range(7):  # the same chance in every tick: one without a push
             state = grasp_rollout.step(dataclasses.replace(state, key=still), jnp.zeros((WORLDS, 12)))
             heights.append(np.asarray(state.physics.qpos[:, 12]))
+            assert (np.abs(state.physics.warmstart[:, 12]).max() < 1e-4) == (len(heights) <= 4), "weightless"
         np.testing.assert_array_equal(heights[:4], [heights[0]] * 4)
         steps = grasp_env.config.physics.substeps * np.arange(1, 4)  # semi-implicit Euler: n (n + 1) / 2 g h^2
         fall = 0.5 * 9.81 * steps * (steps + 1) * grasp_env.config.physics.timestep**2
         np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], WORLDS), rtol=0.02)
 
 
-class TestTrouble:
-    def test_a_world_that_blows_up(self, grasp_rollout, history):
-        """It terminates, shows sober numbers, and the others never notice.
+def test_a_world_that_blows_up(grasp_rollout, history):
+    """It terminates, shows sober numbers, and the others never notice.
 
-        World 2 turns into NaN within the tick; world 5 gets motors that throw its joints to speeds that are finite,
-        but not of this world; worlds 1 and 6 get an action that is not a number.
-        """
-        state, action, following = history[3]
-        object = dataclasses.replace(state.episode.object, mass=state.episode.object.mass.at[2].set(jnp.nan))
-        motors = dataclasses.replace(
-            state.episode.hand.actuator,
-            **{
-                name: getattr(state.episode.hand.actuator, name).at[5].set(value)
-                for name, value in (("stiffness", 1e3), ("stall_torque", 1e3), ("no_load_speed", 1e30))
-            },
-        )
-        after = grasp_rollout.step(
-            with_episode(state, object=object, hand=dataclasses.replace(state.episode.hand, actuator=motors)),
-            action.at[1, 0].set(jnp.nan).at[6].set(jnp.nan),
-        )
-        bad, good = np.array([1, 2, 5, 6]), np.array([0, 3, 4, 7])
-        assert np.all(after.terminated[bad]) and not np.any(after.truncated[bad])
-        assert np.all(after.metrics["non_finite"][bad[1:3]] == 1)
-        assert_same(after, following, good)
-        assert not np.any(after.metrics["non_finite"][good])
-        assert np.all(np.abs(after.reward) < 100)
-        for name in ("reward", "obs", "metrics", "physics", "episode_return"):
-            for path, value in leaves(getattr(after, name)).items():
-                assert np.all(np.isfinite(value)), (name, path)
-        begun = grasp_rollout.restart(after, after.terminated)
-        assert all(np.all(np.isfinite(value)) for value in leaves(begun).values())
+    World 2 turns into NaN within the tick; world 5 gets motors that throw its joints to speeds that are finite,
+    but not of this world; worlds 1 and 6 get an action that is not a number.
+    """
+    state, action, following = history[3]
+    object = dataclasses.replace(state.episode.object, mass=state.episode.object.mass.at[2].set(jnp.nan))
+    motors = dataclasses.replace(
+        state.episode.hand.actuator,
+        **{
+            name: getattr(state.episode.hand.actuator, name).at[5].set(value)
+            for name, value in (("stiffness", 1e3), ("stall_torque", 1e3), ("no_load_speed", 1e30))
+        },
+    )
+    after = grasp_rollout.step(
+        with_episode(state, object=object, hand=dataclasses.replace(state.episode.hand, actuator=motors)),
+        action.at[1, 0].set(jnp.nan).at[6].set(jnp.nan),
+    )
+    bad, good = np.array([1, 2, 5, 6]), np.array([0, 3, 4, 7])
+    assert np.all(after.terminated[bad]) and not np.any(after.truncated[bad])
+    assert np.all(after.metrics["non_finite"][bad[1:3]] == 1)
+    assert_same(after, following, good)
+    assert not np.any(after.metrics["non_finite"][good])
+    assert np.all(np.abs(after.reward) < 100)
+    for name in ("reward", "obs", "metrics", "physics", "episode_return"):
+        for path, value in leaves(getattr(after, name)).items():
+            assert np.all(np.isfinite(value)), (name, path)
+    begun = grasp_rollout.restart(after, after.terminated)
+    assert all(np.all(np.isfinite(value)) for value in leaves(begun).values())
 
 
 class TestReadings:
@@ -351,49 +327,7 @@ class TestReadings:
         tips = jax.jit(jax.vmap(lambda q: forward_kinematics(hand, q).tip_position))(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
-
-
-class TestTouch:
-    def test_a_plate_at_rest_on_the_fingertips_weighs_m_g(self, hand, grasp_env, grasp_rollout):
-        """Fingers bent to a fist, a plate inside it on four tips, 0.3 to 1 kg: sum F = m g.
-
-        The plate is carried by nothing else (see c_scene). Soft contacts let it creep by mm/s.
-        """
-        mass = np.linspace(0.3, 1.0, WORLDS)
-        half = np.array([0.006, 0.036, 0.011])
-        speck = np.full(3, 1e-4)
-        inertia = mass[:, None] / 3 * (np.sum(half**2) - half**2)
-        target = dataclasses.replace(
-            grasp_rollout.reset(jax.random.key(0)).episode.object,
-            shape_index=np.full(WORLDS, SHAPES.index("box")),
-            size=np.tile(np.stack([half, speck, speck]), (WORLDS, 1, 1)),
-            position=np.zeros((WORLDS, 3, 3)),
-            active=np.tile([True, False, False], (WORLDS, 1)),
-            mass=mass,
-            inertia=inertia,
-            com=np.zeros((WORLDS, 3)),
-            friction=np.full(WORLDS, 0.9),
-            contact=np.tile([1700.0, 2.0], (WORLDS, 1)),
-        )
-        fist = np.array([0, 0, 0, 0, *[1.57] * 8])
-        qpos = np.tile([*fist, 0.039, -0.005, 0.0795, 1, 0, 0, 0], (WORLDS, 1))
-        state = placed(grasp_rollout, 0, qpos, np.zeros((WORLDS, 18)), target)
-        level = dataclasses.replace(state.episode.hand, tilt=jnp.zeros((WORLDS, 2)))
-        state, still = with_episode(state, hand=level), state.key
-        for _ in range(40):  # the same chance in every tick: one without a push
-            state = grasp_rollout.step(dataclasses.replace(state, key=still), jnp.zeros((WORLDS, 12)))
-        assert np.all(np.linalg.norm(state.physics.qvel[:, 12:15], axis=1) < 0.015), "still moving"
-        names = set()
-        for world in range(WORLDS):
-            model = c_scene.compile_scene(hand, c_scene.row(target, world))
-            data = c_scene.start(model, state.physics.qpos[world], state.physics.qvel[world])
-            mujoco.mj_forward(model, data)
-            names |= {model.geom(c.geom[0]).name for c in data.contact}
-        pads = {"index_pad", "mid_pad", "ring_pad", "pinky_pad"}
-        assert {name.rpartition("/")[0] for name in names} == pads, names
-
-        weight = mass * 9.81
-        np.testing.assert_allclose(np.sum(state.finger_force, -1), weight, rtol=0.05)
-        np.testing.assert_allclose(np.sum(state.taxel_force, (-1, -2)), weight, rtol=0.05)
-        assert np.all(np.asarray(state.finger_force)[:, 0] == 0)
-        assert np.all(np.asarray(state.finger_force)[:, 1:] > 0.05 * weight[:, None])
+        # Taxels have the part of a finger's force that presses into the skin.
+        felt, pressing = np.asarray(after.finger_force), np.asarray(after.taxel_force.sum(-1))
+        touching = pressing > 0.1
+        assert touching.sum() >= 5 and 0.8 < np.median(pressing[touching] / felt[touching]) < 0.9999

@@ -111,13 +111,9 @@ def test_it_runs_from_reset_to_restart(env):
     jax.tree.map(lambda new, old: (new.shape, new.dtype) == (old.shape, old.dtype) or pytest.fail(), again, state)
 
 
-def outcome(*gives):
-    task = SimpleNamespace(name="balance", reward=lambda *_: gives)
-    return reward_of(task, None, None, jnp.zeros((), bool))
-
-
 @pytest.mark.parametrize("reward", [True, np.float64(1.0), jnp.float16(1.0)])
 def test_a_reward_may_be_any_number(reward):
     """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
-    found, _ = outcome(reward, {})
+    task = SimpleNamespace(name="balance", reward=lambda *_: (reward, {}))
+    found, _ = reward_of(task, None, None, jnp.zeros((), bool))
     assert (found.shape, found.dtype, float(found)) == ((), jnp.float32, 1.0)

@@ -34,9 +34,6 @@ def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
     return points[keep], value[keep], normal[keep]
 
 
-# --- meshes --------------------------------------------------------------------------------------
-
-
 def turned(part):
     part.invert()
     return part
@@ -101,8 +98,6 @@ def test_a_hollow_ball_is_signed_right():
     value = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
     np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
 
-
-# --- grids ---------------------------------------------------------------------------------------
 
 SMOOTH = {"sphere": (0.03,), "capsule": (0.013, 0.025)}
 

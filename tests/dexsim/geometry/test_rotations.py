@@ -12,7 +12,6 @@ QUATS = RNG.normal(size=(64, 4))
 QUATS /= np.linalg.norm(QUATS, axis=1, keepdims=True)
 AXES = RNG.normal(size=(64, 3))
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
-ANGLES = RNG.uniform(-7, 7, 64)
 
 
 def f32(x):

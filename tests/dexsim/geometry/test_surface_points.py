@@ -14,25 +14,21 @@ FEW = 300
 nearest = jax.jit(surface_points.nearest)
 
 
-def union():
-    """A box with a capsule jutting out, and a primitive that is switched off."""
-    return sdf.Shape(
-        ("box", "capsule", "sphere"),
-        jnp.array([[0.02, 0.02, 0.02], [0.01, 0.015, 0], [0.05, 0, 0]]),
-        jnp.array([[0, 0, 0], [0, 0, 0.03], [0.2, 0, 0]]),
-        jnp.tile(jnp.eye(3), (3, 1, 1)),
-        jnp.array([True, True, False]),
-    )
-
-
 def probes(shape, count=2000, room=0.004, seed=0):
     low, high = bounds(shape)
     return np.random.default_rng(seed).uniform(low - room, high + room, (count, 3)).astype(np.float32)
 
 
 def test_the_search_finds_the_nearest():
-    """Against a k-d tree; 300 points do not fill the last block."""
-    shape = union()
+    """Against a k-d tree, on a box with a capsule jutting out and a primitive that is switched off; 300 points do not
+    fill the last block."""
+    shape = sdf.Shape(
+        ("box", "capsule", "sphere"),
+        jnp.array([[0.02, 0.02, 0.02], [0.01, 0.015, 0], [0.05, 0, 0]]),
+        jnp.array([[0, 0, 0], [0, 0, 0.03], [0.2, 0, 0]]),
+        jnp.tile(jnp.eye(3), (3, 1, 1)),
+        jnp.array([True, True, False]),
+    )
     surface = surface_points.from_shape(shape, FEW)
     points = probes(shape)
     real = np.asarray(surface.position)

@@ -92,7 +92,8 @@ def test_driven_hinges_keep_their_ratio(coupled):
     """Half a second of C MuJoCo under a spring at each motor."""
     size, still = np.full((1, 3), 0.02), (0.0, 0.0, 0.0)
     physics = Physics(coupled, ("box",), size, PhysicsConfig(), gravity=still, backend="c")
-    box, goal = sample_object(jax.random.key(0), ObjectConfig(shapes=("box",))), jnp.array([1.0, 0.8])
+    box = jax.jit(lambda key: sample_object(key, ObjectConfig(shapes=("box",))))(jax.random.key(0))
+    goal = jnp.array([1.0, 0.8])
     qpos = jnp.concatenate([hinge_angles(coupled, jnp.zeros(2)), jnp.array([0.5, 0, 0, 1, 0, 0, 0.0])])
     state = PhysicsState(qpos, jnp.zeros(10), jnp.zeros(10))
 

@@ -97,9 +97,6 @@ def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(hand):
         np.testing.assert_allclose(share.max(), 1.0, rtol=1e-4)
 
 
-# --- taxels ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("finger", [0, 4])
 def test_taxels_are_the_published_lattice(hand, finger):
     table = THUMB_TAXELS if finger == 0 else FINGER_TAXELS
@@ -148,9 +145,6 @@ def test_passes_the_checks(name, capsys):
     out = capsys.readouterr().out
     assert out.count("ok  ") == 9 and "pairs" in out
     assert ("index_intermediate (x 1.064)" in out) == (name == "inspire_like")
-
-
-# --- files ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -41,9 +41,6 @@ def log_of(truth, seed=0, target=TARGET, latency=2, noise=0.001, torque_noise=0.
     return JointLog(PERIOD, target, position + noise * errors[0], torque + torque_noise * errors[1])
 
 
-# --- excitation ----------------------------------------------------------------------------------
-
-
 def test_the_hand_stays_within_its_limits(hand):
     targets = excitation(hand, PERIOD, amplitude=1.5)
     assert set(targets) == set(hand.joint_names)
@@ -251,9 +248,6 @@ def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
     result = quick(dataclasses.replace(log, position=log.position + 0.001 * noise[0], torque=torque), FIT)
     for name in FIT:
         assert result.intervals[name][0] <= TRUTH[name] <= result.intervals[name][1], name
-
-
-# --- refusals ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,6 @@ def test_inertia_is_that_of_the_solid(name):
     assert seen == ACTIVE[name]
 
 
-# --- ranges ----------------------------------------------------------------------------------------
-
-
 def within(values, span, scale=1.0):
     values = np.asarray(values)
     low, high = (scale * s for s in span)
@@ -129,9 +126,6 @@ def test_a_template_has_the_slots_of_its_shapes_and_the_same_objects(shapes, slo
         np.testing.assert_allclose(few.inertia, all.inertia, rtol=1e-6)
         plain = jax.vmap(functools.partial(unit_inertia, config=config))(few)
         np.testing.assert_allclose(plain, jax.vmap(unit_inertia)(all), rtol=1e-6)
-
-
-# --- reach -------------------------------------------------------------------------------------------
 
 
 def test_extent_is_the_bound_of_the_turned_shape():

@@ -84,31 +84,16 @@ def assert_same(first, second):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
-class TestClosedForms:
-    def test_free_fall_under_a_push(self, tick, grips):
-        """Semi-implicit Euler: after n steps v = n a dt and x = n (n + 1) / 2 a dt^2."""
-        target, state = at(grips[:WORLDS], AWAY)
-        push = np.float32(np.random.default_rng(1).normal(size=(WORLDS, 3)))
-        after, force = jax.device_get(tick(target, state, push))
-        acceleration = np.array(GRAVITY) + push / np.asarray(target.mass)[:, None]
-        np.testing.assert_allclose(after.qvel[:, 12:15], 3 * 0.01 * acceleration, rtol=1e-5)
-        np.testing.assert_allclose(after.qpos[:, 12:15] - AWAY, 6 * 0.01**2 * acceleration, atol=2e-7)
-        assert not np.any(np.asarray(force))
-        np.testing.assert_allclose(after.warmstart[:, 12:15], acceleration, rtol=1e-5)
-
-    def test_an_object_that_somebody_holds_stays_and_is_weightless(self, physics, grips):
-        target, state = map(row0, at(grips[:1], AWAY, velocity=[0.1, 0, 0, 0, 0, 0]))
-        advance = jax.jit(lambda held: physics.advance(hold, target, state, jnp.ones(3), held=held))
-        free, held = advance(jnp.array(False)).state, advance(jnp.array(True)).state
-        assert_same(free, jax.jit(lambda: physics.advance(hold, target, state, jnp.ones(3)))().state)
-        np.testing.assert_array_equal(held.qpos[12:], state.qpos[12:])
-        np.testing.assert_array_equal(held.qvel[12:], 0.0)
-        np.testing.assert_allclose(held.warmstart[12:15], 0.0, atol=1e-4)  # no acceleration by gravity or push
-        np.testing.assert_array_equal(held.qpos[:12], free.qpos[:12])
-
-
-def row0(tree):
-    return jax.tree.map(lambda leaf: leaf[0], tree)
+def test_free_fall_under_a_push(tick, grips):
+    """Semi-implicit Euler: after n steps v = n a dt and x = n (n + 1) / 2 a dt^2."""
+    target, state = at(grips[:WORLDS], AWAY)
+    push = np.float32(np.random.default_rng(1).normal(size=(WORLDS, 3)))
+    after, force = jax.device_get(tick(target, state, push))
+    acceleration = np.array(GRAVITY) + push / np.asarray(target.mass)[:, None]
+    np.testing.assert_allclose(after.qvel[:, 12:15], 3 * 0.01 * acceleration, rtol=1e-5)
+    np.testing.assert_allclose(after.qpos[:, 12:15] - AWAY, 6 * 0.01**2 * acceleration, atol=2e-7)
+    assert not np.any(np.asarray(force))
+    np.testing.assert_allclose(after.warmstart[:, 12:15], acceleration, rtol=1e-5)
 
 
 class TestForces:
@@ -158,17 +143,6 @@ def test_batches_of_any_size_and_order_loops_and_scans_give_the_same_bits(physic
     for _ in range(3):
         state = tick(target, state, push)[0]
     assert_same(scanned, state)
-
-
-def test_a_gradient_is_refused_by_name(physics, grips):
-    target, state, _ = batch_of(grips[:1])
-
-    def height(push):
-        return physics.advance(hold, row0(target), row0(state), push)[0].qpos[12]
-
-    with pytest.raises(ValueError, match="cannot be differentiated"):
-        jax.grad(height)(jnp.zeros(3))
-    assert np.isfinite(jax.jit(height)(jnp.zeros(3)))
 
 
 class TestTrouble:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dexsim.physics.cuda.scene import (
     MAX_CONTACTS,
     Buffer,
+    Links,
     args_type,
     declare_args,
     find_links,
@@ -80,32 +81,22 @@ def geom_type(kind: str) -> int:
 
 
 @functools.cache
-def in_links(slots: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The link [G] of each geom, its rotation [G, 3, 3] and place [G, 3] there: the palm's after those of the hinges,
-    the object's last."""
-    model, links = scene_of(slots).model, find_links(scene_of(slots))
-    body, hinges = model.geom_bodyid, links.hinges
-    turn = links.rotation[body] @ np.array([rotation_matrix(quat) for quat in model.geom_quat])
-    place = links.place[body] + np.einsum("gij,gj->gi", links.rotation[body], model.geom_pos)
-    return np.choose(links.link[body] + 1, [hinges, *range(hinges), hinges + 1]), turn, place
+def links_of(slots: tuple[str, ...]) -> Links:
+    return find_links(scene_of(slots))
 
 
 @functools.cache
 def finder(slots: tuple[str, ...]):
     """`find_contacts` of the scene of these slots."""
     scene = scene_of(slots)
-    buffers = [
-        Buffer("geom_size", 3 * (len(slots) + len(scene.tip_geoms))),
-        Buffer("geom_pos", 3 * len(slots)),
-        Buffer("geom_quat", 4 * len(slots)),
-    ]
-    text = "\n".join([declare_args(buffers), kernel_constants(scene)])
+    primitives, tips = len(slots), len(scene.tip_geoms)
+    sizes = {"geom_size": 3 * (primitives + tips), "geom_pos": 3 * primitives, "geom_quat": 4 * primitives}
+    text = "\n".join([declare_args([Buffer(*each) for each in sizes.items()]), kernel_constants(scene)])
     library = ctypes.CDLL(str(warp_emulation.build(text, "contacts.cpp")))
 
     def find(worlds):
         """Contacts [N, MAX_CONTACTS] of worlds and their numbers [N]."""
-        names = ("size", "place", "quat", "links", "object")
-        arrays = [np.array([getattr(world, name) for world in worlds], np.float32) for name in names]
+        arrays = [np.array(parts, np.float32) for parts in zip(*(world.arrays() for world in worlds), strict=True)]
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
         contacts, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
         args = args_type(3)((ctypes.c_void_p * 3)(*pointers[:3]), len(worlds))
@@ -117,88 +108,70 @@ def finder(slots: tuple[str, ...]):
 
 
 class World:
-    """A random world in which a pair is near contact and all else is far away."""
+    """Sizes and poses of all geoms, far from each other and turned at random; the floor is where the file has it."""
 
-    def __init__(self, scene: PhysicsScene, pair: int, random: np.random.Generator):
-        model, slots = scene.model, len(scene.slots)
-        first, second = int(model.pair_geom1[pair]), int(model.pair_geom2[pair])
-        self.scene, self.pair = scene, pair
+    def __init__(self, scene: PhysicsScene, random: np.random.Generator):
+        model = scene.model
         tips = model.geom_size[scene.tip_geoms] * random.uniform(0.8, 1.2)
-        self.size = rounded(np.array([*(draw_size(kind, random) for kind in scene.slots), *tips]))
-        self.quat = random.normal(size=(slots, 4))
-        self.quat /= np.linalg.norm(self.quat, axis=1, keepdims=True)
-        self.turn = np.array([rotation_matrix(quat) for quat in self.quat])
-        self.place = np.array([[40.0 * (k + 1), 0, 0] for k in range(slots)])
-        self.place[scene.object_geoms == second] = random.normal(size=3) * 0.01
-        self.place = rounded(self.place)
-        hinges = model.nv - 6
-        self.links = np.array([pose(np.eye(3), [10.0 * k, -50, 50]) for k in range(hinges)] + [pose(np.eye(3), 0)])
-        self.object = pose(np.eye(3), [0, 0, 200])
-        self.data = mujoco.MjData(model)
-        self._write()
-        self._meet(first, second, random)
+        self.scene, self.size = scene, np.array([*(draw_size(kind, random) for kind in scene.slots), *tips])
+        self.place = 50.0 + 10.0 * np.arange(model.ngeom)[:, None] * [1, -1, 1]
+        self.turn = Rotation.random(model.ngeom, random_state=random).as_matrix()
+        self.floor = model.geom("floor").id
+        self.place[self.floor] = model.geom_pos[self.floor]
+        self.turn[self.floor] = rotation_matrix(model.geom_quat[self.floor])
 
-    def contacts(self) -> np.ndarray:
-        """The pair's in C MuJoCo, as `CONTACT`."""
-        model, data = self.scene.model, self.data
-        # As float32 has them; not the rotations, which C MuJoCo needs to be ones.
-        self.links[:, 9:], self.object[9:] = rounded(self.links[:, 9:]), rounded(self.object[9:])
-        self._write()
+    def in_mujoco(self) -> mujoco.MjData:
+        model, data = self.scene.model, mujoco.MjData(self.scene.model)
+        model.geom_size[[*self.scene.object_geoms, *self.scene.tip_geoms]] = self.size
+        data.geom_xpos[:], data.geom_xmat[:] = self.place, self.turn.reshape(-1, 9)
         mujoco.mj_collision(model, data)
-        first, second = int(model.pair_geom1[self.pair]), int(model.pair_geom2[self.pair])
-        rows = []
-        for contact in data.contact[: data.ncon]:
-            if {*contact.geom.tolist()} == {first, second} and contact.dist < 0:
-                side = 1 if contact.geom1 == first else -1
-                rows.append((contact.dist, contact.pos, side * contact.frame[:3], self.pair))
-        return np.array(rows, CONTACT)
+        return data
 
-    def _write(self) -> None:
-        """The geoms' sizes and poses in C MuJoCo."""
-        scene, model = self.scene, self.scene.model
-        slots = len(scene.slots)
-        model.geom_size[scene.object_geoms], model.geom_size[scene.tip_geoms] = self.size[:slots], self.size[slots:]
-        link, turn, place = (part.copy() for part in in_links(scene.slots))
-        turn[scene.object_geoms], place[scene.object_geoms] = self.turn, self.place
-        at = np.vstack([self.links, self.object])[link]
-        rotation = at[:, :9].reshape(-1, 3, 3)
-        self.data.geom_xpos[:] = at[:, 9:] + np.einsum("gij,gj->gi", rotation, place)
-        self.data.geom_xmat[:] = (rotation @ turn).reshape(-1, 9)
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Sizes; places and quaternions of the primitives in the object; poses of the links, the palm's last, and of
+        the object, which is near its nearest primitive and as askew as the floor."""
+        model, links, geoms = self.scene.model, links_of(self.scene.slots), self.scene.object_geoms
+        poses = np.tile(pose(np.eye(3), 0), (links.hinges + 1, 1))
+        for geom, body in enumerate(model.geom_bodyid):
+            if 0 <= links.link[body] < links.hinges:
+                turn = self.turn[geom] @ (links.rotation[body] @ rotation_matrix(model.geom_quat[geom])).T
+                here = links.place[body] + links.rotation[body] @ model.geom_pos[geom]
+                poses[links.link[body]] = pose(turn, self.place[geom] - turn @ here)
+        nearest = np.linalg.norm(self.place[geoms], axis=1).argmin()
+        turn, place = self.turn[self.floor], self.place[geoms[nearest]] + 0.01
+        quat = np.roll(Rotation.from_matrix(turn.T @ self.turn[geoms]).as_quat(), 1, axis=1)
+        return self.size, (self.place[geoms] - place) @ turn, quat, poses, pose(turn, place)
 
-    def _meet(self, first: int, second: int, random: np.random.Generator) -> None:
+    def meet(self, first: int, second: int, random: np.random.Generator) -> None:
         """Bring the geom `second` near `first`, with a gap of -4 to 1 mm."""
-        model, data = self.scene.model, self.data
-        if model.geom_bodyid[first]:
-            self._move(first, draw_rotation(random), 0.05 * random.normal(size=3) - data.geom_xpos[first])
-        axes = data.geom_xmat[first].reshape(3, 3)
-        turn = draw_rotation(random)
+        if first != self.floor:
+            self.place[first] = 0.05 * random.normal(size=3)
+        model, axes = self.scene.model, self.turn[first]
         if random.uniform() < 0.5:  # almost flat on it, or parallel to it
             # On the rim of a cylinder the place of a contact is no more exact than the tilt.
             least = -3 if model.geom_type[second] == mujoco.mjtGeom.mjGEOM_CYLINDER else -5
             tilt = Rotation.from_rotvec(random.normal(size=3) * 10.0 ** random.uniform(least, -1)).as_matrix()
             spin = Rotation.from_rotvec([0, 0, random.choice([0, 1, 1]) * random.uniform(0, 2 * np.pi)]).as_matrix()
-            turn = tilt @ axes @ spin @ data.geom_xmat[second].reshape(3, 3).T
+            self.turn[second] = tilt @ axes @ spin
         way = random.normal(size=3)
         if random.uniform() < 0.5:
             way = axes[:, random.integers(3)] * random.choice([-1, 1]) + 0.2 * way
-        if model.geom_type[first] == mujoco.mjtGeom.mjGEOM_PLANE:
+        if first == self.floor:
             way = axes[:, 2]
-        start = data.geom_xpos[first] + 0.2 * way / np.linalg.norm(way)
-        self._move(second, turn, start - data.geom_xpos[second])
+        self.place[second] = self.place[first] + 0.2 * way / np.linalg.norm(way)
         ends = np.zeros(6)
-        distance = mujoco.mj_geomDistance(model, data, first, second, 1.0, ends)
+        distance = mujoco.mj_geomDistance(model, self.in_mujoco(), first, second, 1.0, ends)
         near = (ends[:3] - ends[3:]) / np.linalg.norm(ends[:3] - ends[3:])
-        self._move(second, np.eye(3), (distance - random.uniform(-0.004, 0.001)) * near)
+        self.place[second] += (distance - random.uniform(-0.004, 0.001)) * near
 
-    def _move(self, geom: int, turn: np.ndarray, shift: np.ndarray) -> None:
-        """Turn a geom about its middle, and shift it, with the link or the object that has it."""
-        centre = self.data.geom_xpos[geom].copy()
-        link = in_links(self.scene.slots)[0][geom]
-        at = self.object if link == len(self.links) else self.links[link]
-        at[9:] = centre + shift + turn @ (at[9:] - centre)
-        at[:9] = (turn @ at[:9].reshape(3, 3)).ravel()
-        self.data.geom_xpos[geom] = centre + shift
-        self.data.geom_xmat[geom] = (turn @ self.data.geom_xmat[geom].reshape(3, 3)).ravel()
+    def contacts(self, first: int, second: int) -> np.ndarray:
+        """Those of two geoms in C MuJoCo, as `CONTACT`."""
+        rows = []
+        for contact in self.in_mujoco().contact:
+            if {*contact.geom.tolist()} == {first, second} and contact.dist < 0:
+                side = 1 if contact.geom1 == first else -1
+                rows.append((contact.dist, contact.pos, side * contact.frame[:3], 0))
+        return np.array(rows, CONTACT)
 
 
 def draw_size(kind: str, random: np.random.Generator) -> np.ndarray:
@@ -206,16 +179,8 @@ def draw_size(kind: str, random: np.random.Generator) -> np.ndarray:
     return np.where(np.arange(3) < used, random.uniform(0.01, 0.04, 3), 0.0)
 
 
-def draw_rotation(random: np.random.Generator) -> np.ndarray:
-    return Rotation.from_quat(random.normal(size=4)).as_matrix()
-
-
 def pose(rotation: np.ndarray, place) -> np.ndarray:
     return np.concatenate([rotation.ravel(), np.broadcast_to(place, 3)])
-
-
-def rounded(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float32).astype(float)
 
 
 def close_to(expected: np.ndarray, contacts: np.ndarray) -> bool:
@@ -236,31 +201,27 @@ def test_contacts_are_those_of_c_mujoco(slots, first, second):
     model = scene.model
     other = model.geom(second if second in HAND else f"object_{slots.index(second)}").id
     (pair,) = np.flatnonzero((model.pair_geom1 == model.geom(first).id) & (model.pair_geom2 == other))
-    worlds = [World(scene, pair, random) for _ in range(WORLDS)]
-    expected = [world.contacts() for world in worlds]
+    worlds = [World(scene, random) for _ in range(WORLDS)]
+    for world in worlds:
+        world.meet(model.geom(first).id, other, random)
+    expected = [world.contacts(model.geom(first).id, other) for world in worlds]
     contacts, count = finder(slots)(worlds)
     contacts = [row[:number][row[:number]["pair"] == pair] for row, number in zip(contacts, count, strict=True)]
     assert np.mean([len(contacts) > 0 for contacts in expected]) > 0.6
-    close = [close_to(*both) for both in zip(expected, contacts, strict=True)]
-    assert np.sum(~np.array(close)) <= 1
-
-
-def crowd(slots: tuple[str, ...], seed: int) -> World:
-    """All geoms almost in one place."""
-    random = np.random.default_rng(seed)
-    world = World(scene_of(slots), 0, random)
-    world.links[:-1, 9:] = 0.005 * random.normal(size=(len(world.links) - 1, 3))
-    world.object[9:], world.place = 0, rounded(0.005 * random.normal(size=world.place.shape))
-    return world
+    assert all(close_to(*both) for both in zip(expected, contacts, strict=True))
 
 
 def test_deepest_contacts_of_a_mesh_are_kept():
-    worlds = [crowd(MESH, seed) for seed in range(20)]
+    """All geoms almost in one place."""
+    scene, random, worlds = scene_of(MESH), np.random.default_rng(0), []
+    for _ in range(20):
+        worlds.append(world := World(scene, random))
+        hand = np.arange(scene.model.ngeom) != world.floor
+        world.place[hand] = 0.005 * random.normal(size=(hand.sum(), 3))
     contacts, count = finder(MESH)(worlds)
     crowded = 0
     for world, rows, number in zip(worlds, contacts, count, strict=True):
-        world.contacts()
-        deepest = np.sort(world.data.contact.dist)[:MAX_CONTACTS]
-        np.testing.assert_allclose(np.sort(rows["gap"][:number]), deepest, atol=1e-5)
-        crowded += world.data.ncon > MAX_CONTACTS
+        gaps = np.sort(world.in_mujoco().contact.dist)
+        np.testing.assert_allclose(np.sort(rows["gap"][:number]), gaps[:MAX_CONTACTS], atol=1e-5)
+        crowded += len(gaps) > MAX_CONTACTS
     assert crowded > 3

@@ -117,10 +117,7 @@ TABLE, WIDE = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS))
     [
         (lambda index, *_: (TABLE[index], OFFSET), "a motor law with .*choose backend mjx"),
         (lambda index, p, v: (jnp.cumsum(p), v), "cumsum"),
-        (
-            lambda index, p, v: (jnp.broadcast_to(p, WIDE.shape) + WIDE, v),
-            r"broadcast_in_dim: .* on \[\] and \[12\]",
-        ),
+        (lambda index, p, v: (jnp.broadcast_to(p, WIDE.shape) + WIDE, v), r"broadcast_in_dim: .* on \[\] and \[12\]"),
     ],
 )
 def test_laws_that_are_not_element_by_element_are_named(law, message):

@@ -1,8 +1,6 @@
-"""Choosing an engine; a guard that names what the physics would drop; private names of MJX."""
+"""Choosing an engine; a guard that names what the physics would drop."""
 
-import ast
 import types
-from pathlib import Path
 
 import jax
 import mujoco
@@ -92,30 +90,3 @@ def test_what_the_engines_simulate_passes(hand):
     joint = 'damping=".1" stiffness=".1" armature=".01" frictionloss=".01"'
     check_model(scene(actuator=motor('gear="2"'), sensor='<jointpos joint="knuckle"/>', joint=joint))
     check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)))
-
-
-DATA = {"contact", "efc_D", "efc_J", "efc_aref", "efc_force", "efc_frictionloss", "ne", "nf"}
-CONTACT = {"dim", "dist", "efc_address", "frame", "friction", "geom", "includemargin"}
-
-
-def used(source: str, *owners: str) -> set[str]:
-    """Attributes taken from expressions or variables with these texts."""
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute)]
-    return {node.attr for node in nodes if ast.unparse(node.value) in owners}
-
-
-def test_the_private_names_of_mjx_exist_and_are_all_listed():
-    from mujoco import mjx  # seconds, which every process of the suite would spend
-
-    from dexsim.physics import mjx_backend
-
-    source = Path(mjx_backend.__file__).read_text()
-    assert used(source, "data._impl", "rows") == DATA
-    assert used(source, "touch", "contact") == CONTACT
-    sphere = '<body><freejoint/><geom size=".1"/></body>'
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{sphere}</worldbody></mujoco>'
-    )
-    private = mjx.make_data(mjx.put_model(model))._impl
-    assert [name for name in DATA if not hasattr(private, name)] == []
-    assert [name for name in CONTACT if not hasattr(private.contact, name)] == []

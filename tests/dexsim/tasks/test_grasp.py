@@ -64,15 +64,12 @@ def goal_of(command):
     return GraspGoal(jnp.float32(command), jnp.zeros((), bool), jnp.zeros(()))
 
 
-class TestTerms:
-    def test_grasp_paper_has_the_papers_reward(self):
-        """sigma 0.1 without a tail, thumb within bounds: R_force of the paper."""
-        weights = paper().reward
-        assert weights.alive == weights.overload == 0 and weights.torque == weights.force
-        found = command_reward(
-            jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool), (0.01, 200.0), 10.0, weights
-        )
-        assert float(found) == pytest.approx((1 + 2 * math.exp(-0.5) + 1) / 5, rel=1e-5)
+def test_grasp_paper_has_the_papers_reward():
+    """sigma 0.1 without a tail, thumb within bounds: R_force of the paper."""
+    weights = paper().reward
+    assert weights.alive == weights.overload == 0 and weights.torque == weights.force
+    found = command_reward(jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool), (0.01, 200.0), 10.0, weights)
+    assert float(found) == pytest.approx((1 + 2 * math.exp(-0.5) + 1) / 5, rel=1e-5)
 
 
 class TestReward:
@@ -183,17 +180,16 @@ class TestChance:
         assert new[changed].mean() == pytest.approx(0.5, abs=0.12)
 
 
-class TestEvaluationPlan:
-    def test_commands_and_shapes_are_spread_evenly(self, task, count=33):
-        shape_index = np.sort(np.arange(400) % 5)
-        index, goal = task.evaluation_plan(count, shape_index)
-        command = np.asarray(goal.command)
-        assert index.shape == command.shape == (count,) and np.all(np.asarray(goal.fixed))
-        cells = np.array(
-            [[np.sum((command == c) & (shape_index[index] == s)) for s in range(5)] for c in np.float32(COMMANDS)]
-        )
-        assert cells.sum() == count and np.ptp(cells) <= 1
-        assert np.ptp(cells.sum(1)) <= 1
+def test_commands_and_shapes_are_spread_evenly(task, count=33):
+    shape_index = np.sort(np.arange(400) % 5)
+    index, goal = task.evaluation_plan(count, shape_index)
+    command = np.asarray(goal.command)
+    assert index.shape == command.shape == (count,) and np.all(np.asarray(goal.fixed))
+    cells = np.array(
+        [[np.sum((command == c) & (shape_index[index] == s)) for s in range(5)] for c in np.float32(COMMANDS)]
+    )
+    assert cells.sum() == count and np.ptp(cells) <= 1
+    assert np.ptp(cells.sum(1)) <= 1
 
 
 class TestPool:

@@ -14,7 +14,6 @@ from episodes import still_moment
 from scipy.spatial.transform import Rotation
 
 import dexsim
-from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import tip_twist
@@ -96,18 +95,17 @@ class TestGoal:
         with pytest.raises(ConfigError, match="expected 3 numbers"):
             RotateConfig(reference=(0.0, 0.0))
 
-    @pytest.mark.parametrize("degrees", [72.5, 73.5, 90, 106.5, 107.5])
-    def test_within_0_3_rad_is_reached(self, rules, degrees):
-        now = rules.progress(rules.begun, rules.truth(object_quat=turned(degrees)))
-        np.testing.assert_allclose(now.angle, abs(math.radians(degrees) - math.pi / 2), atol=1e-4)
-        assert bool(now.success) == (abs(math.radians(degrees) - math.pi / 2) < 0.3)
-
-    def test_too_far_off_too_fast_or_tilted_is_not(self, rules):
+    def test_within_0_3_rad_is_reached_but_not_too_far_off_too_fast_or_tilted(self, rules):
         def reached(**changes):
             here = rules.truth(**{"object_quat": turned(90)} | changes)
             return bool(rules.progress(rules.begun, here).success)
 
-        assert reached()
+        assert [reached(object_quat=turned(angle)) for angle in (72.5, 73.5, 106.5, 107.5)] == [
+            False,
+            True,
+            True,
+            False,
+        ]
         assert reached(object_position=rules.reference + [0, 0.049, 0])
         assert not reached(object_position=rules.reference + [0, 0.051, 0])
         assert reached(object_spin=[1.9, 5, 5])
@@ -404,16 +402,6 @@ class TestPool:
         monkeypatch.setattr(start, "_make", None)  # It is in the cache.
         jax.tree.map(np.testing.assert_array_equal, pool, task.make_pool(jax.random.key(0)))
 
-    def test_a_damaged_file_of_the_cache_is_made_again(self, monkeypatch, tmp_path):
-        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
-        made = []
-        for _ in range(3):
-            pool = cached_arrays("pools", "key", lambda: made.append(1) or {"rows": np.arange(1000)})
-            np.testing.assert_array_equal(pool["rows"], np.arange(1000))
-            (file,) = (tmp_path / "pools").iterdir()
-            file.write_bytes(file.read_bytes()[: 1000 if len(made) == 1 else None])
-        assert len(made) == 2
-
     @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
     def test_a_cube_stands_on_any_axis(self, axis):
         quat = upright(TurnSpec(axis=axis).unit_axis)
@@ -450,36 +438,35 @@ def test_fingertip_twist_is_c_mujocos(hand):
         np.testing.assert_allclose(twist, np.roll(velocity, 3), atol=1e-5)
 
 
-class TestReport:
-    def test_hand_computed(self):
-        n = 4
-        zero = np.zeros(n)
-        metrics = {
-            "successes": np.array([0.0, 10, 20, 30]),
-            "paper_successes": np.array([1.0, 11, 20, 30]),
-            "time_at_last_success": np.array([0.0, 20, 30, 60]),
-            "spin": np.full(n, np.pi),
-            "joint_speed": np.full(n, 0.5),
-            "action_rate": zero,
-            "tilt": zero,
-            "pushed_out": np.array([1.0, 0, 0, 0]),
-            "slipped": np.array([0.0, 1, 0, 0]),
-            "non_finite": zero,
-            "duty/0": np.full(n, 0.2),
-            "duty/1": zero,
-            "duty/2": np.full(n, 0.05),
-        }
-        report = summarize(metrics, np.array([100, 1000, 4000, 4000]), 0.03, 4000)
-        assert report["successes"]["mean"]["mean"] == 15
-        assert report["successes"]["median"]["median"] == 15
-        assert report["successes"]["sorted"] == [0, 10, 20, 30]
-        assert report["without_success"]["mean"] == 0.25
-        assert report["seconds_per_success"]["mean"] == pytest.approx((2 + 1.5 + 2) / 3)
-        # 60 goals in 3 + 30 + 120 + 120 s, those after the last goal included.
-        assert report["successes_per_minute"]["mean"] == pytest.approx(60 / (273 / 60))
-        assert report["headline"]["successes per minute, time stuck included"]["value"] == pytest.approx(3600 / 273)
-        assert report["seconds_to_fall"]["mean"] == pytest.approx((3 + 30 + 120 + 120) / 4)
-        assert report["end"] == {"pushed_out": 1, "slipped": 1, "timeout": 2}
-        assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
-        assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
-        assert report["headline"]["fingertips at work (duty over 10 %)"] == 1
+def test_hand_computed():
+    n = 4
+    zero = np.zeros(n)
+    metrics = {
+        "successes": np.array([0.0, 10, 20, 30]),
+        "paper_successes": np.array([1.0, 11, 20, 30]),
+        "time_at_last_success": np.array([0.0, 20, 30, 60]),
+        "spin": np.full(n, np.pi),
+        "joint_speed": np.full(n, 0.5),
+        "action_rate": zero,
+        "tilt": zero,
+        "pushed_out": np.array([1.0, 0, 0, 0]),
+        "slipped": np.array([0.0, 1, 0, 0]),
+        "non_finite": zero,
+        "duty/0": np.full(n, 0.2),
+        "duty/1": zero,
+        "duty/2": np.full(n, 0.05),
+    }
+    report = summarize(metrics, np.array([100, 1000, 4000, 4000]), 0.03, 4000)
+    assert report["successes"]["mean"]["mean"] == 15
+    assert report["successes"]["median"]["median"] == 15
+    assert report["successes"]["sorted"] == [0, 10, 20, 30]
+    assert report["without_success"]["mean"] == 0.25
+    assert report["seconds_per_success"]["mean"] == pytest.approx((2 + 1.5 + 2) / 3)
+    # 60 goals in 3 + 30 + 120 + 120 s, those after the last goal included.
+    assert report["successes_per_minute"]["mean"] == pytest.approx(60 / (273 / 60))
+    assert report["headline"]["successes per minute, time stuck included"]["value"] == pytest.approx(3600 / 273)
+    assert report["seconds_to_fall"]["mean"] == pytest.approx((3 + 30 + 120 + 120) / 4)
+    assert report["end"] == {"pushed_out": 1, "slipped": 1, "timeout": 2}
+    assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
+    assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
+    assert report["headline"]["fingertips at work (duty over 10 %)"] == 1

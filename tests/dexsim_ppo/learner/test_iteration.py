@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.errors import ConfigError
@@ -38,9 +37,9 @@ def numbered(blocks):
     return jax.tree.map(lambda x: x.reshape(blocks, COUNT // blocks, *x.shape[1:]), samples)
 
 
-@pytest.fixture
-def updates(learner, monkeypatch):
-    """The rows of every minibatch, and the metrics of an update under a loss that only lowers the deviation."""
+def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(learner, monkeypatch):
+    """And every minibatch as many rows of each block. The divergence is that of the last epoch: each update lowers
+    log_std by the learning rate (Adam under a constant gradient)."""
     rows = []
 
     def downward(params, config, normalizers, batch, old_log_std):
@@ -50,13 +49,6 @@ def updates(learner, monkeypatch):
     monkeypatch.setattr(update, "loss", downward)
     _, metrics = update.update(UPDATES, {}, numbered(BLOCKS), jax.random.key(2), learner)
     jax.effects_barrier()
-    return rows, metrics
-
-
-def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
-    """And every minibatch as many rows of each block. The divergence is that of the last epoch: each update lowers
-    log_std by the learning rate (Adam under a constant gradient)."""
-    rows, metrics = updates
     assert len(rows) == UPDATES.epochs * UPDATES.minibatches
     epochs = np.concatenate(rows).reshape(UPDATES.epochs, COUNT)
     np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(COUNT), (UPDATES.epochs, 1)))
@@ -209,49 +201,37 @@ class TestRunningStats:
         np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
 
 
-class TestAdam:
-    def test_against_numpy(self):
-        rng = np.random.default_rng(0)
-        params = {"a": rng.normal(size=3), "b": rng.normal(size=(2, 2))}
-        grads = [{k: rng.normal(size=v.shape) for k, v in params.items()} for _ in range(5)]
-        single = lambda tree: jax.tree.map(jnp.float32, tree)  # noqa: E731
-        state, got = init_adam(single(params)), single(params)
-        moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
-        for t, grad in enumerate(grads, start=1):
-            got, state = step_adam(single(grad), state, got, 0.01)
-            for k, g in grad.items():
-                m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
-                moments[k] = m, v
-                params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-5)
-        for k in params:
-            np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
+def test_against_numpy():
+    rng = np.random.default_rng(0)
+    params = {"a": rng.normal(size=3), "b": rng.normal(size=(2, 2))}
+    grads = [{k: rng.normal(size=v.shape) for k, v in params.items()} for _ in range(5)]
+    single = lambda tree: jax.tree.map(jnp.float32, tree)  # noqa: E731
+    state, got = init_adam(single(params)), single(params)
+    moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
+    for t, grad in enumerate(grads, start=1):
+        got, state = step_adam(single(grad), state, got, 0.01)
+        for k, g in grad.items():
+            m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
+            moments[k] = m, v
+            params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-5)
+    for k in params:
+        np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
 
 
-class TestConfig:
-    def test_learning_rate_adapts_within_its_band(self):
-        config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
-        rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl), 0))  # noqa: E731
-        assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
-        config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
-        wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
-        assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
-        halved = dataclasses.replace(config, kl_target=0.04, kl_halving=100)
-        for iteration, target in ((0, 0.04), (100, 0.02), (300, 0.01)):
-            for share, factor in ((0.49, 1.5), (0.51, 1.0), (1.99, 1.0), (2.01, 1 / 1.5)):
-                after = adapt_learning_rate(halved, jnp.float32(1e-3), jnp.float32(share * target), iteration)
-                assert float(after) == pytest.approx(1e-3 * factor), (iteration, share)
-        fixed = dataclasses.replace(config, kl_target=0.0)
-        assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
-
-
-@given(st.integers(1, 6), st.integers(1, 40))
-def test_any_split_into_batches_gives_the_same_statistics(parts, size):
-    data = np.random.default_rng(size).normal(size=(parts * size, 2)).astype(np.float32)
-    stats = init_stats((2,))
-    for batch in np.split(data, parts):
-        stats = merged(stats, batch)
-    np.testing.assert_allclose(stats.mean, data.mean(0), rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(stats.variance, data.var(0), rtol=1e-3, atol=1e-5)
+def test_learning_rate_adapts_within_its_band():
+    config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
+    rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl), 0))  # noqa: E731
+    assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
+    config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
+    wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
+    assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
+    halved = dataclasses.replace(config, kl_target=0.04, kl_halving=100)
+    for iteration, target in ((0, 0.04), (100, 0.02), (300, 0.01)):
+        for share, factor in ((0.49, 1.5), (0.51, 1.0), (1.99, 1.0), (2.01, 1 / 1.5)):
+            after = adapt_learning_rate(halved, jnp.float32(1e-3), jnp.float32(share * target), iteration)
+            assert float(after) == pytest.approx(1e-3 * factor), (iteration, share)
+    fixed = dataclasses.replace(config, kl_target=0.0)
+    assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
 
 
 # --- the curriculum: ranges that widen with success, carried in the training state ------------------------

@@ -25,12 +25,6 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    """A finished run on one device."""
-    return tiny_train.finished_run(tmp_path_factory.mktemp("alone") / "run", *OPTIONS, *STEPS)
-
-
 def start_two(*options):
     """Two processes of one device each, as Slurm starts them."""
     with socket.socket() as free:
@@ -54,16 +48,8 @@ def last_state(folder):
     }
 
 
-def assert_same_training(folder, other):
-    mine, theirs = last_state(folder), last_state(other)
-    assert mine.keys() == theirs.keys() and int(mine[".iteration"]) == ITERATIONS
-    assert not np.array_equal(mine[".params.log_std"], np.full(1, np.log(0.6), np.float32))
-    for name, leaf in mine.items():
-        np.testing.assert_allclose(leaf, theirs[name], rtol=2e-3, atol=2e-4, err_msg=name)
-
-
 @pytest.mark.slow
-def test_a_killed_process_ends_the_run_and_it_can_be_resumed(alone, tmp_path):
+def test_a_killed_process_ends_the_run_and_it_can_be_resumed(tmp_path):
     folder = RunFolder(tmp_path / "run")
     runs = start_two(*OPTIONS, "--minutes", 3, "--keep-checkpoints", 1000, "--run-dir", folder.path)
     try:
@@ -81,4 +67,8 @@ def test_a_killed_process_ends_the_run_and_it_can_be_resumed(alone, tmp_path):
         if path != folder.checkpoint(5):
             path.unlink()
     assert train.main(["--resume", str(folder.path), *STEPS, "--minutes", "0", "--devices", "1"]) == 0
-    assert_same_training(folder, alone)
+    mine, theirs = last_state(folder), last_state(tiny_train.finished_run(tmp_path / "alone", *OPTIONS, *STEPS))
+    assert mine.keys() == theirs.keys() and int(mine[".iteration"]) == ITERATIONS
+    assert not np.array_equal(mine[".params.log_std"], np.full(1, np.log(0.6), np.float32))
+    for name, leaf in mine.items():
+        np.testing.assert_allclose(leaf, theirs[name], rtol=2e-3, atol=2e-4, err_msg=name)
