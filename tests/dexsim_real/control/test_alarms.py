@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
-from dexsim_real.control.alarms import Alarms, joint_labels
+from dexsim_real.control.alarms import Alarms, Lasting, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction
 from dexsim_real.wire.frames import Mode
@@ -37,6 +37,15 @@ def bench(hand):
     for _ in range(round(2.0 / CYCLE)):
         cycle(bench)
     return bench
+
+
+@pytest.mark.parametrize(("pause", "seconds"), [(0.05, 0.29 - 0.05 + 0.29), (0.15, 0.29)])
+def test_a_short_pause_is_subtracted_from_a_finding_and_a_long_one_ends_it(pause, seconds):
+    """0.3 s with it, the pause, 0.3 s with it, in answers every 10 ms."""
+    lasting, pattern = Lasting(), [True] * 30 + [False] * round(pause / 0.01) + [True] * 30
+    for k, active in enumerate(pattern):
+        lasted = lasting.update(1.0 + 0.01 * k, active)
+    assert lasted == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize("part", [0, 12, 17])
@@ -158,7 +167,7 @@ def test_a_stalled_joint_is_relaxed_and_named(bench):
             bench,
             MIDDLE + 0.3 * FREE,
             follow=False,
-            read=MIDDLE + 1e-4 * (round(bench.now / CYCLE) % 2),
+            read=MIDDLE + 0.02 * np.sin(10 * bench.now),  # It trembles.
             current=current,
         )
     assert 3.0 < bench.now - start < 3.1
@@ -168,7 +177,7 @@ def test_a_stalled_joint_is_relaxed_and_named(bench):
 def test_a_joint_that_moves_at_high_current_or_rests_at_a_low_one_is_not_stalled(bench):
     current = changed(np.full(12, 1.25, np.float32), 9, 1.5)
     for k in range(round(8.0 / CYCLE)):
-        bench.position = changed(MIDDLE, 9, MIDDLE[9] + 0.2 * np.sin(k * CYCLE))
+        bench.position = changed(MIDDLE, 9, MIDDLE[9] + 0.08 * np.sin(k * CYCLE))
         assert cycle(bench, bench.position, current=current).mode == Mode.POSITION
 
 
@@ -189,6 +198,13 @@ def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench, moving)
     assert bench.safety.latched == "no joint angle changes while the commands move" and bench.now - start < 2.5
 
 
+def test_frozen_encoders_are_noticed_where_a_command_moves_by_less_than_a_third_of_a_radian(bench):
+    frozen, current = bench.position.copy(), np.full(12, 0.7, np.float32)
+    for _ in range(round(3.0 / CYCLE)):
+        cycle(bench, MIDDLE + np.float32(0.29) * (JOINTS == 4), read=frozen, current=current)
+    assert bench.safety.latched == "no joint angle changes while the commands move"
+
+
 @pytest.mark.parametrize("pair", [[0, 1], [4, 9]])
 def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pair):
     """From the moment at which they are far apart; nearly equal angles are no jump when they are swapped."""
@@ -205,7 +221,7 @@ def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pa
 
 
 def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
-    """A tenth of a second late; and held by an object against a high current."""
+    """A tenth of a second late; and held by an object against little current, as of weak motors."""
     past = [bench.position] * 8
     for _ in range(round(6.0 / CYCLE)):
         decision = cycle(bench, wave(bench), read=past.pop(0), current=np.full(12, 0.05, np.float32))
@@ -213,7 +229,7 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
         assert decision.reaction < Reaction.HOLD, decision.reason
     for k in range(round(2.0 / CYCLE)):
         seen = bench.position + np.float32(1e-3) * (k % 2)
-        decision = cycle(bench, MIDDLE + 0.55 * FREE, read=seen, follow=False, current=np.full(12, 0.8, np.float32))
+        decision = cycle(bench, MIDDLE + 0.55 * FREE, read=seen, follow=False, current=np.full(12, 0.2, np.float32))
         assert decision.reaction < Reaction.HOLD, decision.reason
 
 
@@ -254,3 +270,13 @@ def test_serious_refusals_turn_the_motors_off_in_a_row_or_as_every_other_answer(
         alarms.update(20.0 + k, sample(20.0 + k).measured, None)
         alarms.refuse(hot)
     assert alarms.fatal == hot.text
+
+
+def test_serious_refusals_as_every_fourth_answer_turn_the_motors_off_at_the_fifth(hand):
+    hot, alarms, refused = read_refusal((1501028).to_bytes(4, "little")), Alarms(hand, SafetyConfig()), 0
+    while not alarms.fatal and refused < 20:
+        alarms.refuse(hot)
+        refused += 1
+        for k in range(3 * (not alarms.fatal)):
+            alarms.update(refused + 0.1 * k, sample(refused + 0.1 * k).measured, None)
+    assert refused == 5
