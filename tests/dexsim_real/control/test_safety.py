@@ -127,7 +127,7 @@ def test_motors_that_come_on_at_or_beyond_an_end_stop_begin_at_it(hand, way):
     """Not at the margin, which would be a jump; a target then moves it off the stop, slowly at first, never back."""
     bench = Bench(hand, margin=0.05)
     stop = np.asarray(hand.joint_upper if way > 0 else hand.joint_lower, np.float32)
-    bench.position = stop + np.float32(0.04) * way
+    bench.position = stop + np.float32(0.09) * way
     bench.engage()
     np.testing.assert_array_equal(bench.cycle().position, stop)
     np.testing.assert_array_equal(bench.cycle(target=stop, hold=UNSEEN).position, stop)
@@ -286,6 +286,25 @@ def test_too_much_force_eases_slowly_toward_the_measured_pose(bench, way):
     path += [d.position for d in bench.run(0.5, target=target, follow=False, force=30.0)]
     np.testing.assert_allclose(np.diff(path, axis=0)[:8, FREE > 0], -way * 0.475 * CYCLE, rtol=1e-3)
     np.testing.assert_allclose(path[-1], MIDDLE, atol=1e-6)
+
+
+@pytest.mark.parametrize(("pause", "eased"), [(0.4, 0.1), (0.6, 0.15)])
+def test_holds_for_force_with_a_short_pause_ease_by_a_tenth_of_a_radian_together(bench, pause, eased):
+    """Meanwhile the measured pose moves by 0.15 rad; after a longer pause easing begins from where it is then."""
+    bench.run(0.3, target=MIDDLE, follow=False, force=30.0)
+    ticks = round(pause / CYCLE)
+    for k in range(ticks):
+        bench.position = MIDDLE - np.float32(0.15 * (k + 1) / ticks) * FREE
+        bench.cycle(target=MIDDLE, follow=False)
+    last = bench.run(0.8, target=MIDDLE, follow=False, force=30.0)[-1]
+    np.testing.assert_allclose(last.position, MIDDLE - np.float32(eased) * FREE, atol=1e-3)
+
+
+def test_holds_for_a_fifth_of_the_time_never_turn_the_motors_off(bench):
+    for _ in range(25):
+        bench.run(0.5, target=MIDDLE, hold=UNSEEN)
+        bench.run(2.2, target=MIDDLE)
+    assert not bench.safety.latched
 
 
 # --- motors off ----------------------------------------------------------------------------------
