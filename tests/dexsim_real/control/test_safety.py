@@ -221,10 +221,14 @@ def test_the_defaults_are_below_what_the_hand_can_do_and_above_what_policies_ask
     limits = SafetyConfig()
     assert limits.speed < hand.speed_limit.min() and limits.joint_speed < hand.speed_limit.max()
     assert limits.finger_force <= 15.0 and limits.total_force <= 80.0, "N, of the hand's specification"
+    assert 60.0 <= limits.temperature <= 70.0, "degC: motors at work are warm"
+    assert limits.reach <= 0.6, "rad, to which a stuck joint is driven"
     assert 0.03 <= limits.margin <= 0.2 * (hand.joint_upper - hand.joint_lower).min()
+    assert limits.stale >= 3 * 0.012, "s: two answers may be lost"
     for name in ("grasp", "rotate", "rotate_without_orientation"):
         policy = load_policy(name)
         assert policy.spec.control.step * policy.control_rate <= limits.speed
+        assert limits.watchdog >= 2 / policy.control_rate, "a target may be late by a tick"
 
 
 # --- holds ---------------------------------------------------------------------------------------
