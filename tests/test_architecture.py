@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_835,  # goal: 4,000
     "dexsim_real": 8_570,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 19_235,  # goal: 18,000
+    "tests": 19_245,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -1,5 +1,6 @@
 """Files: whole or not at all, and none that is read is replaced."""
 
+import json
 import os
 from pathlib import Path
 
@@ -70,3 +71,10 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mod
         yield b"3"
 
     write_atomic(tmp_path / "old", chunks())
+
+
+def test_json_reads_back_and_has_a_list_of_numbers_on_one_line(tmp_path):
+    data = {"text": ["[\n 1\n]", 'x, "y"'], "nested": [[1.5, None], {"a": []}]}
+    cli.write_json(tmp_path / "a.json", data)
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text) == data and "[1.5, null]" in text
