@@ -1,13 +1,15 @@
 """Training defaults per device: sizes and durations."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import jax
 
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
@@ -88,10 +90,9 @@ def find_preset(name: str, task: str) -> Preset:
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # Half of the environments: twice the updates from the same experience, for the gait.
         # Touch tells an orientation over time only; of a cube, past actions tell as much as a memory.
-        memory: Literal["none", "gru"] = "gru" if task == "rotate_any" else "none"
+        ppo = replace(ppo, num_envs=16384, memory="gru" if task == "rotate_any" else "none")
         # The ranges of `rotate_any` are wide enough without extremes: four times the goals after 120 million steps.
         extremes = 0.0 if task == "rotate_any" else preset.extremes
-        ppo = replace(ppo, num_envs=16384, memory=memory)
         if task in ("rotate", "rotate_without_orientation"):  # A slip costs seconds later: fewer cubes are lost.
             ppo = replace(ppo, discount=0.995)
         # Steps in place of minutes, so that any GPU trains what is shipped. After 800 million steps a rotation turns as
@@ -108,7 +109,9 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     if name != "auto" and name not in PRESETS:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
-    preset = find_preset(device_preset() if name == "auto" else name, task)
+    # A task of your own learns like the one whose configuration it extends.
+    like = "grasp" if isinstance(env_config, GraspConfig) else "rotate" if isinstance(env_config, RotateConfig) else ""
+    preset = find_preset(device_preset() if name == "auto" else name, task if task.startswith(like) else like)
     if preset.minutes and hasattr(env_config, "trap"):  # Few steps: the first goals come after half as many without.
         env_config = replace(env_config, trap=0.0)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.

@@ -85,6 +85,14 @@ def test_extremes_and_no_force_loop_are_for_training_alone():
     assert training_config(plain) is plain.env, "by which an evaluation knows that it may use the same environment"
 
 
+def test_a_task_of_your_own_learns_like_the_one_that_it_extends():
+    class Still(RotateConfig):
+        pass
+
+    own, parent = (preset_arguments(task, Still(), "cpu") for task in ("still", "rotate"))
+    assert own == dataclasses.replace(parent, task="still")
+
+
 def test_the_ranges_of_rotation_widen_after_five_goals_and_narrow_below_half_of_them():
     """In 180 iterations from a tenth to the full ranges: a run of half an hour has about 500."""
     rules = find_preset("cpu", "rotate").curriculum
