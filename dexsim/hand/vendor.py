@@ -197,7 +197,8 @@ def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
         remedy = "--drop-tendons gives each of their joints a motor, --couple FOLLOWER=LEADER:RATIO couples two"
         raise ConfigError(f"tendons {names}: not supported; {remedy}")
     pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
-    for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
+    tied = [equality for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_TENDON]
+    for element in (*spec.keys, *spec.sensors, *pulled, *tied, *spec.tendons):
         spec.delete(element)
 
 
@@ -295,6 +296,8 @@ def _read_links(
             content = _read_body(model, data, body, last)
         low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
         leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
+        if leader < 0 and not model.jnt_limited[j]:
+            notes.append(f"assumed      joint {names[j]}: no range in the file, half a turn to both sides")
         link = Link(
             parent=row[above],
             joint=names[j],
