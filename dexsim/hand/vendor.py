@@ -24,6 +24,7 @@ LEAST_MASS = 1e-3
 _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
+_LARGEST = 2.0  # m, of a link: none of a hand is so large
 
 
 @dataclasses.dataclass(eq=False, kw_only=True)
@@ -98,6 +99,10 @@ def read_hand(
         if spec.tendons:
             _drop_tendons(spec, drop_tendons)
         links = _read_links(spec.compile(), palm, freeze, couple, _urdf_speeds(root), notes)
+        for link in links:
+            if link.surface is not None and np.max(link.surface.extents) > _LARGEST:
+                long = f"link {link.name} is {np.max(link.surface.extents):.0f} m long"
+                raise ConfigError(f'{long}: meshes in millimetres need scale="0.001 0.001 0.001"')
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
     except (ElementTree.ParseError, ValueError, ConfigError) as error:

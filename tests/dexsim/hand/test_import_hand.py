@@ -225,3 +225,11 @@ def test_joints_without_a_range_are_named_and_show_no_palm_side(tmp_path, given)
     assert sum("no range in the file" in line for line in draft.findings) == 6
     with pytest.raises(AssetError, match="no palm side found"):
         orient(draft, **given)
+
+
+def test_meshes_in_millimetres_are_an_error(tmp_path):
+    path = urdf(tmp_path)
+    for file in tmp_path.glob("meshes/*.stl"):
+        trimesh.load(file).apply_scale(1000.0).export(file)
+    with pytest.raises(AssetError, match='m long: meshes in millimetres need scale="0.001'):
+        read_hand(path)
