@@ -233,3 +233,15 @@ def test_meshes_in_millimetres_are_an_error(tmp_path):
         trimesh.load(file).apply_scale(1000.0).export(file)
     with pytest.raises(AssetError, match='m long: meshes in millimetres need scale="0.001'):
         read_hand(path)
+
+
+def test_a_hand_that_is_there_is_not_replaced(tmp_path):
+    folder = tmp_path / "hand"
+    folder.mkdir()
+    path = mjcf(folder)
+    for file in (path, folder / "hand.toml"):
+        path.rename(file)
+        before = file.read_bytes()
+        with pytest.raises(AssetError, match=f"{file.name}: exists; give another folder with --out"):
+            import_hand.main([str(mjcf(tmp_path)), "--out", str(folder), "--yes"])
+        assert file.read_bytes() == before
