@@ -155,7 +155,7 @@ def mirror_taxels(text: str) -> str:
 
 
 def check_new(folder: Path, name: str) -> Path:
-    """The TOML that a hand of this name gets. Raises AssetError: it or the MJCF exists, which somebody may have edited."""
+    """The TOML that a hand of this name gets. Raises AssetError: it or the MJCF exists, and may be edited."""
     for path in (folder / f"{name}.xml", folder / f"{name}.toml"):
         if path.exists():
             raise AssetError(f"{path}: exists; give another folder with --out")
