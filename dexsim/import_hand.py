@@ -27,7 +27,7 @@ from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import fingertip_strength
 from dexsim.hand.load import find_hand, load_hand
-from dexsim.hand.mirror import swap_sides, write_mirror
+from dexsim.hand.mirror import check_new, swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp
 from dexsim.hand.vendor import LEAST_MASS, Draft, Link, read_hand
 
@@ -48,7 +48,7 @@ class ImportArguments(Config):
     """The maker's URDF or MJCF; with --mirror also a hand's TOML, or the name of a shipped one. Meshes may be missing:
     their links get no capsule, fingertips an assumed one."""
     out: Path
-    """Folder to write."""
+    """Folder to write, without a hand of its name."""
     mirror: bool = False
     """Write the mirror image: a left hand of a right one, or the other way round."""
     palm: str = ""
@@ -90,6 +90,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     """Write a maker's hand into a folder: the TOML, and whether it passes its checks."""
     name = re.sub(r"\W", "_", arguments.out.resolve().name)  # the folder's
     name = swap_sides(name) if arguments.mirror else name
+    check_new(folder, name)
     draft = read_hand(
         arguments.file,
         palm=arguments.palm,

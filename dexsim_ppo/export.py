@@ -209,6 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.output is None and arguments.bundle is None:
         raise ConfigError("give --output FILE or --bundle FOLDER_OR_ZIP")
     policy = load_policy(arguments.policy)
+    cli.check_no_overwrite({"--output": arguments.output}, {"policy": arguments.policy})
     if arguments.output:
         cli.check_writable(arguments.output)
         to_onnx(policy, arguments.output)

@@ -112,6 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError("give --lerobot FOLDER, --rrd FILE or --npz FILE")
     policy = load_policy(arguments.policy, task=arguments.task)
     # First what could be wrong after minutes of simulation.
+    cli.check_no_overwrite({"--rrd": arguments.rrd, "--npz": arguments.npz}, {"policy": arguments.policy})
     if arguments.lerobot:
         check_lerobot(arguments.lerobot)
     if arguments.rrd:

@@ -61,7 +61,7 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
     vertices, faces = given if isinstance(given, tuple) else (given.vertices, given.faces)
     if not len(faces) or not np.all(np.isfinite(vertices)):
         raise AssetError(f"{name}: {'a vertex is not finite' if len(faces) else 'no triangles'}")
-    size = float(scale * np.ptp(vertices, axis=0).max())
+    size = float(scale * np.ptp(np.asarray(vertices)[np.ravel(faces)], axis=0).max())  # without loose vertices
     if not SMALLEST <= size <= LARGEST:
         raise AssetError(
             f"{name}: {size:.3g} m across at scale {scale:g}, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
@@ -145,7 +145,7 @@ def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple
 
 def _merged(mesh: Trimesh) -> Trimesh:
     """The mesh with vertices at one place made one, and without triangles that vanish by it."""
-    mesh.merge_vertices(digits_vertex=round(-np.log10(_SAME * np.ptp(mesh.vertices, axis=0).max())))
+    mesh.merge_vertices(digits_vertex=round(-np.log10(_SAME * mesh.extents.max())))
     mesh.update_faces((np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all(1))
     return mesh
 

@@ -140,9 +140,12 @@ def _find_frame(
     if normal is None:
         z = unit(z - across * (across @ z))
         x = np.cross(across, z)
-        x = x * np.sign(x @ sum(_bend(links, chain) for chain in fingers))
+        x = x * np.sign(np.round(x @ sum(_bend(links, chain) for chain in fingers), 9))
     x = unit(x - z * (z @ x))
     rotation = np.stack([x, np.cross(z, x), z])
+    if np.linalg.det(rotation) < 0.5:
+        which = "--normal is along the fingers" if given else "fingers bend as far to both sides"
+        raise AssetError(f"no palm side found, {which}: give --fingers and --normal across them")
     rounded = np.round(rotation)
     snaps = np.all(np.abs(rotation[rounded != 0]) > _SNAP) and np.linalg.det(rounded) == 1
     return rounded if snaps and not given else rotation

@@ -154,12 +154,20 @@ def mirror_taxels(text: str) -> str:
     return "".join(",".join(row) + "\n" for row in (head, *rows))
 
 
+def check_new(folder: Path, name: str) -> Path:
+    """The TOML that a hand of this name gets. Raises AssetError: it or the MJCF exists, and may be edited."""
+    for path in (folder / f"{name}.xml", folder / f"{name}.toml"):
+        if path.exists():
+            raise AssetError(f"{path}: exists; give another folder with --out")
+    return path
+
+
 def write_mirror(path: Path, folder: Path) -> Path:
     """Write the files of a hand's mirror image, its meshes included; the path of the new TOML.
 
     Args:
       path: the hand's TOML.
-      folder: must not have a TOML of the new name.
+      folder: must not have a TOML or an MJCF of the new name.
 
     Raises:
       AssetError: a file of the hand is missing or broken, or the new one exists.
@@ -167,9 +175,7 @@ def write_mirror(path: Path, folder: Path) -> Path:
     hand = load_hand(path)
     stem = swap_sides(path.stem)
     stem = f"{stem}_{OTHER[hand.side]}" if stem == path.stem else stem
-    toml = folder / f"{stem}.toml"
-    if toml.exists():
-        raise AssetError(f"{toml}: exists; give another folder with --out")
+    toml = check_new(folder, stem)
     text = path.read_text()
     model = ElementTree.fromstring(read_mjcf(hand.model_path))
     folder.mkdir(parents=True, exist_ok=True)

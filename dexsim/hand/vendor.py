@@ -24,6 +24,7 @@ LEAST_MASS = 1e-3
 _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
+_LARGEST = 2.0  # m, of a link: none of a hand is so large
 
 
 @dataclasses.dataclass(eq=False, kw_only=True)
@@ -98,6 +99,10 @@ def read_hand(
         if spec.tendons:
             _drop_tendons(spec, drop_tendons)
         links = _read_links(spec.compile(), palm, freeze, couple, _urdf_speeds(root), notes)
+        for link in links:
+            if link.surface is not None and np.max(link.surface.extents) > _LARGEST:
+                long = f"link {link.name} is {np.max(link.surface.extents):.0f} m long"
+                raise ConfigError(f'{long}: meshes in millimetres need scale="0.001 0.001 0.001"')
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
     except (ElementTree.ParseError, ValueError, ConfigError) as error:
@@ -197,7 +202,8 @@ def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
         remedy = "--drop-tendons gives each of their joints a motor, --couple FOLLOWER=LEADER:RATIO couples two"
         raise ConfigError(f"tendons {names}: not supported; {remedy}")
     pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
-    for element in (*spec.keys, *spec.sensors, *pulled, *spec.tendons):
+    tied = [equality for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_TENDON]
+    for element in (*spec.keys, *spec.sensors, *pulled, *tied, *spec.tendons):
         spec.delete(element)
 
 
@@ -295,6 +301,8 @@ def _read_links(
             content = _read_body(model, data, body, last)
         low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.pi, np.pi)
         leader, ratio, offset = followers.get(j, (-1, 1.0, 0.0))
+        if leader < 0 and not model.jnt_limited[j]:
+            notes.append(f"assumed      joint {names[j]}: no range in the file, half a turn to both sides")
         link = Link(
             parent=row[above],
             joint=names[j],

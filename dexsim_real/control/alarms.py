@@ -150,7 +150,10 @@ class Alarms:
             self._changed = position, goal
         if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
-        lasts = self._away.update(time, (np.abs(goal - position) > _FAR) & (measured.current < _IDLE))
+        # A joint that draws current may press on something. But no command leads beyond `reach`: it was taken there.
+        apart = np.abs(goal - position)
+        lost = (measured.current < _IDLE) | (apart > self.config.reach + _FAR)
+        lasts = self._away.update(time, (apart > _FAR) & lost)
         joint = int(lasts.argmax())
         if not text and lasts[joint] > _UNNOTICED:
             text = (

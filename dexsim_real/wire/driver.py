@@ -153,7 +153,9 @@ class DriverPort(HandPort):
         joint["raw_position"] = np.where(on, Mode.POSITION, Mode.PASSIVE)
         joint["current"] = 1e3 * current
         joint["temperature"] = np.clip(heat, 0, 255)
-        joint["joint_error"] = _checked("errors", state.errors, joints, state.errors is not None)
+        errors = _checked("errors", state.errors, joints, state.errors is not None)
+        # Whatever does not fit must not read as no error.
+        joint["joint_error"] = np.where(errors == (errors.astype(int) & 0xFFFF), errors, 0xFFFF)
         block["tip"]["taxel"]["z"] = force / NEWTONS_PER_COUNT
         return block
 

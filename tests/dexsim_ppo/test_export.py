@@ -17,7 +17,7 @@ from dexsim.control import move_target
 from dexsim.errors import CalibrationError, ConfigError, DexsimError
 from dexsim.hand.load import load_hand
 from dexsim.observation import FIELDS
-from dexsim_ppo import export, load_policy
+from dexsim_ppo import export, load_policy, record
 from dexsim_ppo.portable import PortablePolicy
 
 SHIPPED = ROOT / "assets" / "policies"
@@ -112,6 +112,13 @@ def test_a_bundle_that_cannot_be_written_is_one_line(arguments, error, message, 
     (tmp_path / "taken").mkdir()
     with pytest.raises(error, match=message):
         export.main(["grasp", *arguments])
+
+
+@pytest.mark.parametrize(("command", "option"), [(export, "--output"), (record, "--npz"), (record, "--rrd")])
+def test_no_output_takes_the_place_of_the_policy(command, option, tmp_path):
+    path = str(shutil.copy(SHIPPED / "grasp.msgpack", tmp_path))
+    with pytest.raises(ConfigError, match=f"{option} .*: is the policy; name another file"):
+        command.main([path, option, path])
 
 
 def test_every_field_that_an_actor_may_observe_has_a_unit():

@@ -182,7 +182,7 @@ def mjcf(folder, tail="", bodies=("thumb", "f", "g")):
 
 
 def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
-    path = mjcf(tmp_path, TENDON)
+    path = mjcf(tmp_path, TENDON + '<equality><tendon tendon1="cord"/></equality>')
     (follower,) = (link for link in read_hand(path, drop_tendons=True, couple=("f_b=f_a:0.7",)).links if link.leader)
     assert (follower.joint, follower.leader, follower.ratio) == ("f_b", "f_a", 0.7)
 
@@ -215,3 +215,33 @@ def test_the_frame_is_confirmed(tmp_path):
     orient(draft, along=(0, 0, 2), normal=(-1, 0, 0.1))
     (link,) = (link for link in draft.links if link.joint == "f_a")
     assert draft.side == "left" and abs(link.axis[1]) == 1 and link.anchor[2] == 0.05
+
+
+@pytest.mark.parametrize("given", [{}, {"along": (0, 0, 1), "normal": (0, 0, 1)}])
+def test_joints_without_a_range_are_named_and_show_no_palm_side(tmp_path, given):
+    path = mjcf(tmp_path)
+    path.write_text(path.read_text().replace(' range="0 1.5"', ""))
+    draft = read_hand(path)
+    assert sum("no range in the file" in line for line in draft.findings) == 6
+    with pytest.raises(AssetError, match="no palm side found"):
+        orient(draft, **given)
+
+
+def test_meshes_in_millimetres_are_an_error(tmp_path):
+    path = urdf(tmp_path)
+    for file in tmp_path.glob("meshes/*.stl"):
+        trimesh.load(file).apply_scale(1000.0).export(file)
+    with pytest.raises(AssetError, match='m long: meshes in millimetres need scale="0.001'):
+        read_hand(path)
+
+
+def test_a_hand_that_is_there_is_not_replaced(tmp_path):
+    folder = tmp_path / "hand"
+    folder.mkdir()
+    path = mjcf(folder)
+    for file in (path, folder / "hand.toml"):
+        path.rename(file)
+        before = file.read_bytes()
+        with pytest.raises(AssetError, match=f"{file.name}: exists; give another folder with --out"):
+            import_hand.main([str(mjcf(tmp_path)), "--out", str(folder), "--yes"])
+        assert file.read_bytes() == before

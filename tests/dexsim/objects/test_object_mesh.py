@@ -11,6 +11,7 @@ import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError
 from dexsim.geometry import distance, sdf
+from dexsim.geometry.mesh import load_mesh
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import load, principal_axes
 from dexsim.objects.params import sample_object
@@ -56,6 +57,12 @@ class TestBoxes:
         corners = (np.asarray(solid.vertices) - solid.center_mass) @ axes
         on_surface = np.abs(sdf.signed_distance(jnp.float32(corners), mesh_object.boxes.shape()))
         assert on_surface.max() < 3e-4 and max(mesh_object.boxes.deviation) < 3e-4
+
+
+def test_loose_vertices_are_no_part_of_a_mesh():
+    cube = trimesh.creation.box((0.05, 0.05, 0.05))
+    mesh = load_mesh((np.vstack([cube.vertices, [[5.0, 5.0, 5.0]]]), cube.faces))
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), 0.05)
 
 
 class TestErrors:

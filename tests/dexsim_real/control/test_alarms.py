@@ -220,6 +220,14 @@ def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pa
     assert any(joint_labels(hand)[joint] in bench.safety.latched for joint in pair)
 
 
+def test_a_motor_that_runs_away_is_noticed_although_it_draws_current(hand, bench):
+    """At 2 rad/s, up to 1 rad from its command."""
+    for k in range(round(1.5 / CYCLE)):
+        seen = changed(MIDDLE, 11, MIDDLE[11] + min(2.0 * CYCLE * k, 1.0))
+        cycle(bench, read=seen, current=np.full(12, 0.5, np.float32))
+    assert f"{joint_labels(hand)[11]} does not follow its command" in bench.safety.latched
+
+
 def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
     """A tenth of a second late; and held by an object against little current, as of weak motors."""
     past = [bench.position] * 8

@@ -68,6 +68,14 @@ def test_a_state_arrives_in_si_units_and_a_command_leaves_in_them(leap):
         HandSensing(leap, HardwareConfig(kp=(1, 2, 3)))
 
 
+def test_error_bits_beyond_the_lower_sixteen_are_not_lost(leap):
+    """A status word of 32 bits would read as no error."""
+    driver = ScriptedDriver(leap)
+    driver.set(errors=np.array([0, 1, 0x10000, 0x20000001, -1] + [0] * 11))
+    reply = opened(leap, driver).exchange(off(leap))
+    assert reply.state["joint"]["joint_error"][:6].tolist() == [0, 1, 0xFFFF, 0xFFFF, 0xFFFF, 0]
+
+
 @pytest.mark.parametrize(
     ("values", "says"),
     [
