@@ -156,10 +156,11 @@ def mirror_taxels(text: str) -> str:
 
 def check_new(folder: Path, name: str) -> Path:
     """The TOML that a hand of this name gets. Raises AssetError: it or the MJCF exists, and may be edited."""
-    for path in (folder / f"{name}.xml", folder / f"{name}.toml"):
+    toml = folder / f"{name}.toml"
+    for path in (toml, toml.with_suffix(".xml")):
         if path.exists():
             raise AssetError(f"{path}: exists; give another folder with --out")
-    return path
+    return toml
 
 
 def write_mirror(path: Path, folder: Path) -> Path:
