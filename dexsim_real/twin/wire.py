@@ -109,7 +109,7 @@ class Firmware:
             return _PARAMETER
         try:
             block = frames.decode(data, frames.COMMAND_BLOCK)
-        except frames.FrameError:
+        except HandError:
             return _ID
         if not np.isin(block["mode"], list(Mode)).all():
             return _MODE

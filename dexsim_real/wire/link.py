@@ -340,7 +340,7 @@ class SerialHand(HandPort):
             return None
         try:
             state = frames.decode(frame.data)
-        except frames.FrameError:
+        except HandError:
             self.counts.answered -= 1
             self.counts.corrupt += 1
             return None
