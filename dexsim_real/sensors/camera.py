@@ -155,19 +155,14 @@ class ObjectEstimate(NamedTuple):
     palm_gravity: np.ndarray = np.zeros(3)  # [3] unit vector
 
 
+@dataclasses.dataclass(eq=False)
 class ObjectSensors:
-    """Camera and IMU, None without one. What neither measures is nominal: the position `reference` [3] m and the
-    direction of `gravity` [3] in the palm frame."""
+    """Camera and IMU, None without one. What neither measures is nominal."""
 
-    def __init__(
-        self,
-        reference: Sequence[float],
-        gravity: Sequence[float],
-        camera: HeightSensor | None = None,
-        imu: ImuReader | None = None,
-    ):
-        self._reference, self._down = np.asarray(reference, float), np.asarray(gravity) / np.linalg.norm(gravity)
-        self.camera, self.imu = camera, imu
+    reference: Sequence[float]  # [3] m, position
+    gravity: Sequence[float]  # [3] in the palm frame, of any length
+    camera: HeightSensor | None = None
+    imu: ImuReader | None = None
 
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
@@ -184,9 +179,10 @@ class ObjectSensors:
 
     def read(self, now: float) -> tuple[ObjectEstimate, float]:
         """The estimate, and the time in s of the newest orientation."""
-        position, velocity = self.camera.read()[1:] if self.camera else (self._reference, np.zeros(3))
+        position, velocity = self.camera.read()[1:] if self.camera else (np.array(self.reference), np.zeros(3))
         if not self.imu:
-            return ObjectEstimate(position, velocity, IDENTITY, self._down), now
+            down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
+            return ObjectEstimate(position, velocity, IDENTITY, down), now
         when, quat = self.imu.read()
         return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
 
