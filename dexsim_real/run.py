@@ -515,13 +515,7 @@ class _Lasting:
 class StatusView:
     """Shows the state of a run from a background thread, which calls `summary` and `hand`. A context manager."""
 
-    def __init__(
-        self,
-        title: str,
-        summary: Callable[[], dict[str, Any]],
-        hand: Callable[[], Table | str],
-        quiet: bool = False,
-    ):
+    def __init__(self, title: str, summary: Callable[[], dict[str, Any]], hand: Callable[[], Table | str], quiet: bool):
         self.console = _console(quiet)
         self._title, self._summary, self._hand = title, summary, hand
         live = self.console.is_terminal and not quiet
@@ -567,11 +561,6 @@ class StatusView:
 
     def _tables(self) -> Group:
         return Group(self._hand(), "", _rows(self._title, self._summary()))
-
-
-def show_summary(title: str, summary: dict[str, Any]) -> None:
-    """Print nested results as a table on the standard error."""
-    _console().print(_rows(title, summary))
 
 
 def _console(quiet: bool = False) -> Console:
@@ -646,7 +635,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
                 print(f"error: {result.problem}", file=sys.stderr)
         if not arguments.quiet:
-            show_summary(f"{arguments.policy}: {result.end}", result.summary)
+            _console().print(_rows(f"{arguments.policy}: {result.end}", result.summary))
         if arguments.output:
             cli.write_json(arguments.output, result.summary)
     return result.code

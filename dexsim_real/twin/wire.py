@@ -325,7 +325,7 @@ class EmulatedCamera:
     """
 
     def __init__(self, path: Path, plant: EmulatedHand, seed: int, start: float):
-        self.path, self.due, self.sent = path, start, 0
+        self.path, self.due = path, start
         self.option = "--camera", f"unix:{path}"
         self._plant, self._rng = plant, np.random.default_rng(seed)
         self._client: socket.socket | None = None
@@ -358,7 +358,6 @@ class EmulatedCamera:
             return
         if not self._waiting:
             mask = picture(self._plant, CameraConfig()) & (self._rng.random() >= _LOST)
-            self.sent += 1
             self._waiting = encode_mask(now, mask)
         try:
             self._waiting = self._waiting[self._client.send(self._waiting) :]
