@@ -82,7 +82,7 @@ def test_a_host_does_not_take_its_own_echo_for_an_answer():
         )
     )
     parser = Parser(HAND_REPLIES)
-    assert parser.feed(echo) + parser.expire() == []
+    assert parser.feed(echo, final=True) == []
     assert len(Parser(HOST_REQUESTS).feed(echo)) == 3
 
 
@@ -119,4 +119,4 @@ def test_damage_costs_only_the_damaged_frames(seed):
         for at in range(0, len(stream), size):
             received += parser.feed(stream[at : at + size])
         assert parser.pending < longest and received == sent[: len(received)]
-    assert received + parser.expire() == sent
+    assert received + parser.feed(b"", final=True) == sent
