@@ -471,9 +471,7 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     objects = ObjectSensors(spec.reference, gravity)
     try:
         if arguments.camera:
-            masks = open_masks(arguments.camera, arguments.optics)
-            reference = np.asarray(spec.reference, float)
-            objects.camera = HeightSensor(masks, arguments.optics, reference, spec.object_axes, spec.velocity_filter)
+            objects.camera = HeightSensor(open_masks(arguments.camera, arguments.optics), arguments.optics, spec)
         if arguments.imu:
             objects.imu = imu = Imu(arguments.imu, arguments.imu_mount)
             imu.wait()
