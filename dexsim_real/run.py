@@ -471,9 +471,7 @@ def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSenso
     objects = ObjectSensors(spec.reference, gravity)
     try:
         if arguments.camera:
-            masks = open_masks(arguments.camera, arguments.optics)
-            reference = np.asarray(spec.reference, float)
-            objects.camera = HeightSensor(masks, arguments.optics, reference, spec.object_axes, spec.velocity_filter)
+            objects.camera = HeightSensor(open_masks(arguments.camera, arguments.optics), arguments.optics, spec)
         if arguments.imu:
             objects.imu = imu = Imu(arguments.imu, arguments.imu_mount)
             imu.wait()
@@ -515,13 +513,7 @@ class _Lasting:
 class StatusView:
     """Shows the state of a run from a background thread, which calls `summary` and `hand`. A context manager."""
 
-    def __init__(
-        self,
-        title: str,
-        summary: Callable[[], dict[str, Any]],
-        hand: Callable[[], Table | str],
-        quiet: bool = False,
-    ):
+    def __init__(self, title: str, summary: Callable[[], dict[str, Any]], hand: Callable[[], Table | str], quiet: bool):
         self.console = _console(quiet)
         self._title, self._summary, self._hand = title, summary, hand
         live = self.console.is_terminal and not quiet
@@ -567,11 +559,6 @@ class StatusView:
 
     def _tables(self) -> Group:
         return Group(self._hand(), "", _rows(self._title, self._summary()))
-
-
-def show_summary(title: str, summary: dict[str, Any]) -> None:
-    """Print nested results as a table on the standard error."""
-    _console().print(_rows(title, summary))
 
 
 def _console(quiet: bool = False) -> Console:
@@ -646,7 +633,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
                 print(f"error: {result.problem}", file=sys.stderr)
         if not arguments.quiet:
-            show_summary(f"{arguments.policy}: {result.end}", result.summary)
+            _console().print(_rows(f"{arguments.policy}: {result.end}", result.summary))
         if arguments.output:
             cli.write_json(arguments.output, result.summary)
     return result.code

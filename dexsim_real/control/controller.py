@@ -178,7 +178,7 @@ class TurnGoals:
     the nominal position of the object.
     """
 
-    def __init__(self, turn: TurnSpec, reference: np.ndarray):
+    def __init__(self, turn: TurnSpec, reference: Sequence[float]):
         self._turn, self._reference = turn, np.asarray(reference)
         self._axis = turn.unit_axis
         self.successes, self.times = 0, list[float]()
@@ -230,9 +230,7 @@ class PolicyLoop:
 
     def __post_init__(self) -> None:
         spec = self.controller.spec
-        self.goals: TurnGoals | None = None
-        if spec.turn and self.objects.imu:
-            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
+        self.goals = TurnGoals(spec.turn, spec.reference) if spec.turn and self.objects.imu else None
         self.ticks, self.finger_force = 0, np.zeros(self.controller.hand.num_fingers)  # number; N, sum over the ticks
         self.sample: HandSample  # that the newest tick saw
         self._begin: float | None = None  # s, of the approach

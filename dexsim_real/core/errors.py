@@ -13,10 +13,6 @@ from typing import Any
 from dexsim.core.errors import DexsimError
 from dexsim.core.install import install_line
 
-_PORT_ERRORS = (OSError, ValueError, NotImplementedError, termios.error)
-"""What opening a serial port raises: `termios.error` when it vanishes meanwhile, `NotImplementedError` for a URL whose
-kind of port lacks a setting, such as rfc2217://."""
-
 
 class HandError(DexsimError):
     """The hand or one of its sensors cannot be reached, or cannot do what was asked."""
@@ -37,7 +33,8 @@ def open_serial(port: str, baud: int, **options: Any) -> Any:
         options["exclusive"] = True
     try:
         return serial.serial_for_url(port, baudrate=baud, **options)
-    except _PORT_ERRORS as error:
+    # It vanishes meanwhile (`termios.error`), or a URL's kind of port lacks a setting (`NotImplementedError`).
+    except (OSError, ValueError, NotImplementedError, termios.error) as error:
         raise HandError(explain(port, error)) from None
 
 

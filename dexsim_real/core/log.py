@@ -114,10 +114,17 @@ class LogWriter(contextlib.AbstractContextManager):
             last = self._stop.wait(_WAIT)
             batch = []
             while not self._queue.empty():
-                batch += self._encoded(*self._queue.get())
+                kind, when, content = self._queue.get()
+                try:
+                    batch.append(encode(kind, when, content))
+                except Exception as error:  # It must not end the thread.
+                    self.failure = f"{self.path}: a {kind.name} record cannot be written ({error})"
+                    self.dropped += 1
                 time.sleep(0)  # Releases the interpreter lock to a waiting thread.
             try:
-                _write_all(self._file, b"".join(batch))
+                data = memoryview(b"".join(batch))
+                while data:
+                    data = data[os.write(self._file, data) :]
                 if last or time.monotonic() - synced > _FORCE:
                     os.fdatasync(self._file)
                     synced = time.monotonic()
@@ -126,14 +133,6 @@ class LogWriter(contextlib.AbstractContextManager):
                 self.dropped += len(batch)
             if last:
                 return
-
-    def _encoded(self, kind: Kind, when: float, content: Any) -> list[bytes]:
-        try:
-            return [encode(kind, when, content)]
-        except Exception as error:  # It must not end the thread.
-            self.failure = f"{self.path}: a {kind.name} record cannot be written ({error})"
-            self.dropped += 1
-            return []
 
 
 def encode(kind: Kind, when: float, content: Any) -> bytes:
@@ -204,9 +203,3 @@ def _unpack_array(value: dict) -> Any:
     if "__array__" not in value:
         return value
     return np.frombuffer(value["data"], value["__array__"]).reshape(value["shape"])
-
-
-def _write_all(file: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(file, view) :]

@@ -29,7 +29,8 @@ class FrameParser(Generic[T]):
         return len(self._buffer)
 
     def feed(self, data: bytes, final: bool = False) -> list[T]:
-        """Add received bytes, the last of a transmission if `final`; returns the frames that they complete."""
+        """Add received bytes; returns the frames that they complete. The last of a transmission if `final`: that drops
+        an incomplete frame, and returns the frames inside its bytes."""
         self._buffer += data
         buffer, found, at, done = self._buffer, list[T](), 0, 0
         while (at := buffer.find(self._head, at)) >= 0:
@@ -53,7 +54,3 @@ class FrameParser(Generic[T]):
             at = len(buffer) if final else max(len(buffer) - next(parts, 0), done)
         del buffer[:at]
         return found
-
-    def expire(self) -> list[T]:
-        """End of transmission: drop an incomplete frame, and return the frames inside its bytes."""
-        return self.feed(b"", final=True)

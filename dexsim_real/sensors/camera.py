@@ -17,6 +17,7 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
+from dexsim.task_spec import TaskSpec
 from dexsim_real.core.errors import HandError, find_function
 from dexsim_real.core.process import BACKGROUND, change_priority
 from dexsim_real.sensors.imu import IDENTITY, ImuReader
@@ -88,17 +89,16 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
 class HeightSensor:
     """Tracks the object from its own thread.
 
-    `axes` tells which coordinate is measured (`Sensing.object_axes`): exactly one, else HandError. The others are those
-    of `reference` [3] m. `weight` is of the newest difference in the velocity (`Sensing.velocity_filter`).
+    `spec.object_axes` tells which coordinate is measured: exactly one, else HandError. The others are those of
+    `spec.reference`.
     """
 
-    def __init__(
-        self, masks: Masks, config: CameraConfig, reference: np.ndarray, axes: tuple[bool, bool, bool], weight: float
-    ):
+    def __init__(self, masks: Masks, config: CameraConfig, spec: TaskSpec):
+        axes = spec.object_axes
         if sum(axes) != 1:
             raise HandError(f"the policy observes the object's coordinates {axes}, and a camera measures one")
-        self._masks, self._config, self._weight = masks, config, weight
-        self._reference, self._axis = np.asarray(reference, float), axes.index(True)
+        self._masks, self._config, self._weight = masks, config, spec.velocity_filter
+        self._reference, self._axis = np.asarray(spec.reference, float), axes.index(True)
         self.newest: tuple[float, np.ndarray, np.ndarray] | None = None
         """What `read` gives; None before the object was seen."""
         self.failure = ""  # why no picture comes any more
@@ -155,19 +155,14 @@ class ObjectEstimate(NamedTuple):
     palm_gravity: np.ndarray = np.zeros(3)  # [3] unit vector
 
 
+@dataclasses.dataclass(eq=False)
 class ObjectSensors:
-    """Camera and IMU, None without one. What neither measures is nominal: the position `reference` [3] m and the
-    direction of `gravity` [3] in the palm frame."""
+    """Camera and IMU, None without one. What neither measures is nominal."""
 
-    def __init__(
-        self,
-        reference: Sequence[float],
-        gravity: Sequence[float],
-        camera: HeightSensor | None = None,
-        imu: ImuReader | None = None,
-    ):
-        self._reference, self._down = np.asarray(reference, float), np.asarray(gravity) / np.linalg.norm(gravity)
-        self.camera, self.imu = camera, imu
+    reference: Sequence[float]  # [3] m, position
+    gravity: Sequence[float]  # [3] in the palm frame, of any length
+    camera: HeightSensor | None = None
+    imu: ImuReader | None = None
 
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
@@ -184,9 +179,10 @@ class ObjectSensors:
 
     def read(self, now: float) -> tuple[ObjectEstimate, float]:
         """The estimate, and the time in s of the newest orientation."""
-        position, velocity = self.camera.read()[1:] if self.camera else (self._reference, np.zeros(3))
+        position, velocity = self.camera.read()[1:] if self.camera else (np.array(self.reference), np.zeros(3))
         if not self.imu:
-            return ObjectEstimate(position, velocity, IDENTITY, self._down), now
+            down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
+            return ObjectEstimate(position, velocity, IDENTITY, down), now
         when, quat = self.imu.read()
         return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
 

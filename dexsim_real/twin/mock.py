@@ -7,7 +7,6 @@ go over the palm again and again. Currents and temperatures are those of the emu
 """
 
 import time
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -21,13 +20,12 @@ _SLIP = 0.1  # s that the plant may be behind the clock; what is more is let go,
 
 
 class MockHand(HandDriver):
-    """A driver whose hand is emulated. The plant advances to the clock's time at each call.
+    """A driver whose hand is emulated. The plant advances to the clock's time at each call."""
 
-    `measures` is what the hand has, names in `driver.WITHOUT`.
-    """
+    measures = frozenset(WITHOUT)
 
-    def __init__(self, plant: EmulatedHand, measures: Iterable[str] = WITHOUT):
-        self.plant, self.measures, self._clock = plant, frozenset(measures), time.monotonic
+    def __init__(self, plant: EmulatedHand):
+        self.plant, self._clock = plant, time.monotonic
 
     def connect(self) -> str:
         self._time = self._clock()
@@ -44,13 +42,13 @@ class MockHand(HandDriver):
 
     def read(self) -> DriverState:
         self._advance()
-        now, has = self.plant.measure(), self.measures
+        now = self.plant.measure()
         return DriverState(
             position=now.joint_position,
             on=self.motors["mode"] == Mode.POSITION,
-            current=1e-3 * now.current if "currents" in has else None,
-            temperature=now.temperature if "temperatures" in has else None,
-            taxel_force=np.maximum(now.taxel_force[..., 2], 0.0) if "taxels" in has else None,
+            current=1e-3 * now.current,
+            temperature=now.temperature,
+            taxel_force=np.maximum(now.taxel_force[..., 2], 0.0),
         )
 
     def close(self) -> None:

@@ -126,8 +126,8 @@ def virtual_imu(port: VirtualPort, seed: int) -> ImuReader:
 
 def virtual_camera(port: VirtualPort, spec: TaskSpec) -> HeightSensor:
     """The bridge's height sensor, without a socket; its pictures come when they are scheduled."""
-    optics, reference = CameraConfig(), np.asarray(spec.reference, float)
-    sensor = HeightSensor(lambda: None, optics, reference, spec.object_axes, spec.velocity_filter)
+    optics = CameraConfig()
+    sensor = HeightSensor(lambda: None, optics, spec)
     port.every(1 / CAMERA_RATE, 0.002, lambda: sensor.update(port.time, picture(port.plant, optics)))
     return sensor
 

@@ -66,11 +66,6 @@ class Firmware:
         self.motors = passive_command()  # `frames.COMMAND_BLOCK` that the joints execute
         self._hot = np.zeros(frames.JOINTS, bool)
 
-    @property
-    def on(self) -> bool:
-        """Whether any motor is on."""
-        return bool(np.any(self.motors["mode"] != Mode.PASSIVE))
-
     def answer(self, frame: Frame) -> Frame | None:
         """Execute a frame and return the answer; None for a frame addressed to another hand."""
         if frame.target not in (_ADDRESS, frames.BROADCAST):
@@ -109,7 +104,7 @@ class Firmware:
             return _PARAMETER
         try:
             block = frames.decode(data, frames.COMMAND_BLOCK)
-        except frames.FrameError:
+        except HandError:
             return _ID
         if not np.isin(block["mode"], list(Mode)).all():
             return _MODE
@@ -117,14 +112,14 @@ class Firmware:
             return _FORCE_MODE
         if not np.isfinite(block["position"]).all():
             return _PARAMETER
-        measured, was_on = self.plant.measure(), self.on
+        measured, was_on = self.plant.measure(), self.motors["mode"].any()
         hot = measured.temperature
         self._hot = (hot > SHUTDOWN) | (self._hot & (hot > SHUTDOWN - 10.0))
         block["mode"][self._hot] = Mode.PASSIVE
         self.motors = block
         self.plant.drive(block)
-        if was_on != self.on:
-            self._note("motors on" if self.on else "motors off")
+        if was_on != (on := block["mode"].any()):
+            self._note("motors on" if on else "motors off")
         return self.state(measured).tobytes()
 
 
@@ -204,7 +199,7 @@ class HandLine:
         """Do what is due."""
         data, rng = self.terminal.read(), self._rng
         if not data and now - self._heard > _SILENCE:
-            self._parser.expire()
+            self._parser.feed(b"", final=True)
         self._heard = now if data else self._heard
         for frame in self._parser.feed(data):
             self.counts["requests"] += 1
@@ -325,7 +320,7 @@ class EmulatedCamera:
     """
 
     def __init__(self, path: Path, plant: EmulatedHand, seed: int, start: float):
-        self.path, self.due, self.sent = path, start, 0
+        self.path, self.due = path, start
         self.option = "--camera", f"unix:{path}"
         self._plant, self._rng = plant, np.random.default_rng(seed)
         self._client: socket.socket | None = None
@@ -358,7 +353,6 @@ class EmulatedCamera:
             return
         if not self._waiting:
             mask = picture(self._plant, CameraConfig()) & (self._rng.random() >= _LOST)
-            self.sent += 1
             self._waiting = encode_mask(now, mask)
         try:
             self._waiting = self._waiting[self._client.send(self._waiting) :]

@@ -2,9 +2,9 @@
 
     55 AA | source | target | command | length, low byte first | data | CRC, low byte first
 
-The CRC is CRC-16/XMODEM over everything before it. A host sends `EXCHANGE` with twelve joint commands and receives the
-whole state; an emulated hand does the reverse. Layouts come from public drivers and headers; docs/hardware.md says how
-certain each one is.
+The CRC is CRC-16/XMODEM (polynomial 0x1021, start 0) over everything before it. A host sends `EXCHANGE` with twelve
+joint commands and receives the whole state; an emulated hand does the reverse. Layouts come from public drivers and
+headers; docs/hardware.md says how certain each one is.
 """
 
 import binascii
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.stream import FrameParser
 
 HEAD = b"\x55\xaa"
@@ -24,10 +24,6 @@ OVERHEAD = HEADER.size + 2  # bytes of a frame without data
 HOST = 0xFE
 BROADCAST = 0xFF
 JOINTS, TIPS, TAXELS = 12, 5, 120
-
-
-class FrameError(DexsimError):
-    """A block has the wrong size or invalid joint ids."""
 
 
 class Command(enum.IntEnum):
@@ -113,11 +109,6 @@ HOST_REQUESTS: dict[int, range] = {
 """Valid data lengths of requests."""
 
 
-def crc16(data: bytes | bytearray | memoryview) -> int:
-    """CRC-16/XMODEM: polynomial 0x1021, start 0, not reflected; 0x31C3 for b"123456789"."""
-    return binascii.crc_hqx(data, 0)
-
-
 def palm_address(hand_id: int) -> int:
     """Bus address of a hand's palm board."""
     return hand_id | 0x80
@@ -139,7 +130,7 @@ class Frame:
     def encode(self) -> bytes:
         """The bytes on the wire."""
         body = HEADER.pack(HEAD, self.source, self.target, self.command, len(self.data)) + self.data
-        return body + crc16(body).to_bytes(2, "little")
+        return body + binascii.crc_hqx(body, 0).to_bytes(2, "little")
 
 
 class Parser(FrameParser[Frame]):
@@ -158,7 +149,7 @@ class Parser(FrameParser[Frame]):
 
 def _read_frame(data: bytes) -> Frame | None:
     _, source, target, command, _ = HEADER.unpack_from(data)
-    sound = crc16(data[:-2]) == int.from_bytes(data[-2:], "little")
+    sound = binascii.crc_hqx(data[:-2], 0) == int.from_bytes(data[-2:], "little")
     return Frame(source, target, command, data[HEADER.size : -2]) if sound else None
 
 
@@ -196,12 +187,12 @@ def passive_command(joints: int = JOINTS) -> np.ndarray:
 def decode(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
     """The block in the data of an `EXCHANGE`: the hand's state, or joint commands (`COMMAND_BLOCK`).
 
-    Raises FrameError: wrong size, or joint ids that do not count up.
+    Raises HandError: wrong size, or joint ids that do not count up.
     """
     if len(data) != dtype.itemsize:
-        raise FrameError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
+        raise HandError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
     block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
     ids = block["id"] if dtype.base == JOINT_COMMAND else block["joint"]["id"]
     if not np.array_equal(ids, np.arange(len(ids))):
-        raise FrameError(f"expected joint ids 0 to {len(ids) - 1} in order, got {ids.tolist()}")
+        raise HandError(f"expected joint ids 0 to {len(ids) - 1} in order, got {ids.tolist()}")
     return block

@@ -340,7 +340,7 @@ class SerialHand(HandPort):
             return None
         try:
             state = frames.decode(frame.data)
-        except frames.FrameError:
+        except HandError:
             self.counts.answered -= 1
             self.counts.corrupt += 1
             return None
@@ -381,7 +381,7 @@ class SerialHand(HandPort):
             data, now = self._read(), self._clock()
             heard = now if data else heard
             final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
-            for frame in self._answers(self._parser.feed(data) + (self._parser.expire() if final else [])):
+            for frame in self._answers(self._parser.feed(data, final)):
                 self._tap("rx", frame.encode())
                 size = frames.OVERHEAD + len(frame.data)
                 possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
@@ -405,7 +405,7 @@ class SerialHand(HandPort):
         late, until = [], self._clock() + self.config.on_wire(_LONGEST) + _QUIET
         while (self._serial.in_waiting or self._parser.pending) and self._clock() < until:
             late += self._parser.feed(self._read())
-        late += self._parser.expire()
+        late += self._parser.feed(b"", final=True)
         self.counts.late += len(self._answers(late))
 
     def _answers(self, answers: list[Frame]) -> list[Frame]:
@@ -437,7 +437,7 @@ class SerialHand(HandPort):
         # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             self._serial.set_low_latency_mode(True)
-        self._parser.expire()
+        self._parser.feed(b"", final=True)
         self._received, self._connected = 0, True
 
     def _handshake(self, patience: float) -> str:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from dexsim_real.twin.plant.drives import Drives, Heat
+from dexsim_real.twin.plant.drives import Drives
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put
 from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.wire.frames import Mode, command_block
@@ -18,8 +18,8 @@ def motors(position, *, kp=100, torque_max=300, mode=Mode.POSITION):
     return command_block(np.broadcast_to(position, 12), kp=kp, ki=0, kd=0, torque_max=torque_max, mode=mode)
 
 
-def drives(hand, heat=None, **overrides):
-    made = Drives(hand.torque_limit, hand.speed_limit, heat or Heat())
+def drives(hand, **overrides):
+    made = Drives(hand.torque_limit, hand.speed_limit)
     made.configure(sample_trial("grasp", np.random.default_rng(0), "nominal", IDEAL | overrides))
     return made
 

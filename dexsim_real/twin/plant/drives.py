@@ -10,7 +10,6 @@ hands stalled at 300 report 0.8 to 1.5 A.
 """
 
 import collections
-import dataclasses
 
 import numpy as np
 
@@ -26,20 +25,14 @@ _HEAT_STEPS = 10  # periods between two updates of the temperature
 _FIELDS = ("position", "kp", "torque_max", "mode")
 _AT_REST = 0.05  # rad/s, speed within which the no-load current changes its sign
 
-
-@dataclasses.dataclass(frozen=True)
-class Heat:
-    """Thermal model of a motor with two bodies: winding, and case with the temperature sensor."""
-
-    resistance: float = 6.0  # Ohm at `reference`
-    rise: float = 0.0039  # 1/K, increase of the resistance (copper)
-    weakening: float = 0.001  # 1/K, decrease of the torque constant (magnets)
-    to_case: float = 8.0  # K/W, thermal resistance from winding to case
-    to_air: float = 14.0  # K/W, thermal resistance from case to air
-    winding: float = 2.0  # J/K, heat capacity
-    case: float = 25.0  # J/K, heat capacity
-    air: float = 26.0  # degC
-    reference: float = 25.0  # degC of `resistance` and of the torque constant
+# Thermal model of a motor with two bodies: winding, and case with the temperature sensor.
+RESISTANCE = 6.0  # Ohm at `REFERENCE`
+RISE = 0.0039  # 1/K, increase of the resistance (copper)
+WEAKENING = 0.001  # 1/K, decrease of the torque constant (magnets)
+TO_CASE, TO_AIR = 8.0, 14.0  # K/W, thermal resistances: from winding to case, from case to air
+WINDING, CASE = 2.0, 25.0  # J/K, heat capacities
+AIR = 26.0  # degC
+REFERENCE = 25.0  # degC of `RESISTANCE` and of the torque constant
 
 
 class Drives:
@@ -48,10 +41,10 @@ class Drives:
     `torque_limit` [12] Nm and `speed_limit` [12] rad/s are the nominal torque at stall and speed without load.
     """
 
-    def __init__(self, torque_limit: np.ndarray, speed_limit: np.ndarray, heat: Heat = Heat()):
-        self._stall, self._fast, self.heat = torque_limit.astype(float), speed_limit.astype(float), heat
+    def __init__(self, torque_limit: np.ndarray, speed_limit: np.ndarray):
+        self._stall, self._fast = torque_limit.astype(float), speed_limit.astype(float)
         joints = len(torque_limit)
-        self.winding, self.case = np.full(joints, heat.air), np.full(joints, heat.air)
+        self.winding, self.case = np.full(joints, AIR), np.full(joints, AIR)
         zero = np.zeros(joints)
         self._board = np.zeros((len(_FIELDS), joints))  # last command of each joint's board
         self.current = zero.copy()  # A, true
@@ -122,16 +115,16 @@ class Drives:
 
     def _warm_up(self) -> None:
         """Update the temperatures and the motors' properties."""
-        heat, time = self.heat, self._steps * PERIOD
-        loss = self.thermal * self._squares / self._steps * heat.resistance
-        loss *= 1 + heat.rise * (self.winding - heat.reference)
-        across = (self.winding - self.case) / heat.to_case
-        self.winding += time * (loss - across) / heat.winding
-        self.case += time * (across - (self.case - heat.air) / heat.to_air) / heat.case
+        time = self._steps * PERIOD
+        loss = self.thermal * self._squares / self._steps * RESISTANCE
+        loss *= 1 + RISE * (self.winding - REFERENCE)
+        across = (self.winding - self.case) / TO_CASE
+        self.winding += time * (loss - across) / WINDING
+        self.case += time * (across - (self.case - AIR) / TO_AIR) / CASE
         self._apply_heat()
 
     def _apply_heat(self) -> None:
-        warmer = self.thermal * np.maximum(self.winding - self.heat.reference, 0.0)
-        self._warm = self.constant * (1.0 - np.minimum(self.heat.weakening * warmer, 0.5))
-        self._stalled = STALL_CURRENT / (1.0 + self.heat.rise * warmer)
+        warmer = self.thermal * np.maximum(self.winding - REFERENCE, 0.0)
+        self._warm = self.constant * (1.0 - np.minimum(WEAKENING * warmer, 0.5))
+        self._stalled = STALL_CURRENT / (1.0 + RISE * warmer)
         self._squares, self._steps = np.zeros_like(self._stalled), 0

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, strategies as st
 from paths import ROOT
 
-from dexsim_real.core import log
 from dexsim_real.core.log import MAGIC, Kind, LogError, LogReader, LogWriter, encode
 
 
@@ -82,8 +81,8 @@ def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path, monkeypatch):
     def full(file, data):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(log, "_write_all", full)
     with LogWriter(tmp_path / "run.log") as writer:
+        monkeypatch.setattr(os, "write", full)
         writer.add(Kind.NOTE, "lost")
     assert writer.losses == f"1 log records are lost ({writer.path}: No space left on device)"
 

@@ -345,7 +345,7 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand):
     tip["temperature"] = np.arange(121, 126)
     measured, targets = HandSensing(hand, HardwareConfig()).measure(block), np.linspace(-2, 1.8, 12)
     tables = run.hand_tables(hand, measured, targets, True)
-    view = run.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables)
+    view = run.StatusView("a title", lambda: {f"row {number}": "x" * 80 for number in range(12)}, lambda: tables, False)
     view.console = Console(width=100, file=io.StringIO())
     view.show()
     shown = view.console.file.getvalue()
@@ -383,7 +383,7 @@ def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
     far, near = os.openpty() if gone == "window" else os.pipe()
     screen = os.fdopen(near, "w", buffering=1)
     monkeypatch.setattr("sys.stderr", screen)
-    view = run.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "")
+    view = run.StatusView("a title", lambda: {"age": "3.1 ms"}, lambda: "", False)
     os.close(far)
     try:
         view.note("before")

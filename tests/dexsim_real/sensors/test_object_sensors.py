@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, strategies as st
 from scipy.spatial.transform import Rotation
 
+from dexsim.task_spec import TaskSpec
 from dexsim_real.core.errors import HandError
 from dexsim_real.run import gravity_of
 from dexsim_real.sensors import imu
@@ -43,7 +44,7 @@ def test_height_from_a_mask(height, yaw, pitch, focal):
 
 
 def tracking(masks):
-    return HeightSensor(masks, CameraConfig(), REFERENCE, (True, False, False), 0.5)
+    return HeightSensor(masks, CameraConfig(), TaskSpec(name="", fields=(), reference=tuple(REFERENCE)))
 
 
 def until(condition):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from calibrating import arguments, operator
-from scripted_driver import DriverBench
+from scripted_driver import DriverBench, ScriptedDriver
 from untrained import untrained
 
 from dexsim import load_hand
@@ -15,14 +15,13 @@ from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.mock import MockHand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.wire.driver import WITHOUT
 
 MOCK = "sdk:dexsim_real.twin.mock"
 
 
-def bench_of(name, measures=WITHOUT):
+def bench_of(name):
     hand = load_hand(name)
-    return DriverBench(hand, MockHand(EmulatedHand(hand, "grasp", kind="nominal"), measures))
+    return DriverBench(hand, MockHand(EmulatedHand(hand, "grasp", kind="nominal")))
 
 
 def test_an_object_that_is_let_go_over_the_hand_is_felt():
@@ -52,7 +51,7 @@ def test_a_policy_runs_and_its_log_is_replayed_to_the_last_bit(name, tmp_path, c
 @pytest.mark.slow
 def test_a_joint_of_another_hand_is_identified(tmp_path):
     """One that moves two hinges, by its angles alone."""
-    bench = bench_of("inspire_like", measures=())
+    bench = bench_of("inspire_like")
     options = arguments(tmp_path, identify=True, joints=("index",), output=tmp_path / "hand.json")
     where = {"port": bench.port, "clock": bench.clock, "sleep": bench.sleep}
     (result,) = identify_hand(options, bench.hand, operator(), **where)
@@ -60,6 +59,7 @@ def test_a_joint_of_another_hand_is_identified(tmp_path):
 
 
 def test_presses_need_taxels_and_currents(tmp_path):
-    bench = bench_of("leap_like", measures=["currents"])
+    hand = load_hand("leap_like")
+    bench = DriverBench(hand, ScriptedDriver(hand, ["currents"]))
     with pytest.raises(HandError, match="presses need taxels and currents, and the hand has no taxels: --identify"):
-        calibrate.record(arguments(tmp_path, port=None, from_log=(tmp_path,)), bench.hand, operator(), port=bench.port)
+        calibrate.record(arguments(tmp_path, port=None, from_log=(tmp_path,)), hand, operator(), port=bench.port)

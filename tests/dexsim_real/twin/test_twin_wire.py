@@ -45,7 +45,7 @@ def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
         answer = ask(board, kind, data)
         assert answer.command == Command.ERROR
         assert int.from_bytes(answer.data, "little") == 1501000 + number
-    assert not board.on and plant.motors is None
+    assert not board.motors["mode"].any() and plant.motors is None
     # What is for another hand is no business of this one; a broadcast is.
     assert ask(board, Command.VERSION, target=0x81) is None
     assert ask(board, Command.VERSION, target=0xFF) is not None
