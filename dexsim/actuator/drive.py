@@ -5,6 +5,8 @@ the paper's text names and leaves out: torque ripple, an encoder that is off, fr
 pytree leaf: drawn per joint and episode, differentiated, fitted.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -24,10 +26,10 @@ class Actuator:
     stall_torque: jax.Array  # tau_0, Nm
     no_load_speed: jax.Array  # qd_max, rad/s
     efficiency: jax.Array  # eta, 1
-    ripple: jax.Array | None = None  # r, share of the torque
-    ripple_count: jax.Array | None = None  # n, ripples per radian of the joint
-    ripple_phase: jax.Array | None = None  # rad
-    encoder_bias: jax.Array | None = None  # rad, measured minus true angle, inside the loop too
+    ripple: Any = None  # r, share of the torque
+    ripple_count: Any = None  # n, ripples per radian of the joint
+    ripple_phase: Any = None  # rad
+    encoder_bias: Any = None  # rad, measured minus true angle, inside the loop too
     coulomb_friction: jax.Array | None = None  # c, Nm
     viscous_friction: jax.Array | None = None  # b, Nm s/rad
 
@@ -74,7 +76,6 @@ def joint_torque(
     torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
     if actuator.ripple is None:
         return torque
-    assert actuator.ripple_count is not None and actuator.ripple_phase is not None
     angle = actuator.ripple_count * position + actuator.ripple_phase
     return torque * (1.0 + actuator.ripple * jnp.sin(angle))
 
