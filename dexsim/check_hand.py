@@ -68,7 +68,7 @@ def check_fingertips(hand: Hand) -> str:
 def check_taxels(hand: Hand) -> str:
     """The taxels of every finger are on the primitives of the link that carries them, and face outwards."""
     for finger, name in enumerate(hand.finger_names):
-        parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.KINDS]
+        parts = [geom for geom in hand.geoms if geom.body == hand.tip_body[finger] and geom.kind in sdf.DISTANCE]
         if not parts:
             continue
         arrays = [np.stack([getattr(part, field) for part in parts]) for field in ("size", "position", "rotation")]

@@ -115,12 +115,6 @@ class HandParams:
     tilt: jax.Array  # [2] rad
     pad_thickness_delta: jax.Array  # [] m, on top of `PhysicsConfig.pad_thickness`
 
-    @property
-    def encoder_bias(self) -> jax.Array:
-        """[J] rad, in readings as in the motors' own loops."""
-        assert self.actuator.encoder_bias is not None
-        return self.actuator.encoder_bias
-
 
 def sample_hand(
     key: jax.Array,

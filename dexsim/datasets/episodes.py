@@ -46,11 +46,10 @@ def write_episodes(path: Path, episodes: Episodes) -> None:
         "lengths": [len(snapshot.joint_position) for snapshot in episodes.snapshots],
     }
     arrays: dict[str, np.ndarray] = {"header": np.array(json.dumps(header))}
-    for field in dataclasses.fields(Snapshot):
-        parts = [getattr(snapshot, field.name) for snapshot in episodes.snapshots]
-        if parts[0] is not None:
-            whole = np.concatenate(parts)
-            arrays[field.name] = whole.astype(np.float16) if whole.dtype.kind == "f" else whole
+    for name, first in vars(episodes.snapshots[0]).items():
+        if first is not None:
+            whole = np.concatenate([getattr(snapshot, name) for snapshot in episodes.snapshots])
+            arrays[name] = whole.astype(np.float16) if whole.dtype.kind == "f" else whole
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_atomic(path, [buffer.getbuffer()])

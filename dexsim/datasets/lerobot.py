@@ -49,8 +49,7 @@ class Trajectory:
         """The same at another rate, Hz: of each instant the nearest tick."""
         instants = np.arange(int(self.time[-1] * rate) + 1) / rate
         nearest = np.rint(np.interp(instants, self.time, np.arange(len(self.time)))).astype(int)
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        picked: dict[str, Any] = {name: None if values is None else values[nearest] for name, values in fields.items()}
+        picked: dict[str, Any] = {name: None if x is None else x[nearest] for name, x in vars(self).items()}
         return Trajectory(**picked | {"time": instants})
 
 

@@ -29,7 +29,7 @@ from dexsim.env.task import GroundTruth, Task, reward_of
 from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand
-from dexsim.hand.kinematics import HandPose, forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams, resample_properties, toward_nominal
 from dexsim.physics.interface import PhysicsState, StepResult
@@ -38,7 +38,7 @@ from dexsim.randomization import sample_hand, tilted_down
 from dexsim.sensing.imu import sample_imu
 from dexsim.sensing.taxels import TaxelArray
 from dexsim.task_spec import TaskSpec, correct_readings
-from dexsim.touch.taxel_force import Touch, compute_touch, project_on_normals
+from dexsim.touch.taxel_force import compute_touch, project_on_normals
 
 
 class Env:
@@ -183,12 +183,22 @@ class Env:
     ) -> GroundTruth:
         """Where all is after the tick, and what the fingertips feel of it; `torque` is `Motors.current_torque`."""
         physics, object, delta = self.physics, episode.object, episode.hand.pad_thickness_delta
+        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
         qpos, qvel, force = result.state.qpos, result.state.qvel, result.finger_force
         joints, place, motion = qpos[physics.joint_qpos], qpos[physics.object_qpos], qvel[physics.object_dof]
-        pose = forward_kinematics(self.hand, joints)
+        pose = forward_kinematics(hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        touch, normal_force, skin_force = self._feel(pose, object, (position, rotation), force, delta)
+        geometry = self.touch_geometry(object)
+        touch = bearing = compute_touch(hand, pose, geometry, position, rotation, length(force), skin, delta)
+        # In the links' frames, where the normals are constants.
+        local = rotations.rotate_inverse(pose.tip_rotation, force)
+        pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
+        if self.config.touch_method != "closed_form" or skin.margin != thickness:
+            # The contact's springs have the geometry and the rubber of the solver.
+            shape, bare, cover = object.shape(), jnp.ones(hand.num_fingers), jnp.maximum(delta, -thickness)
+            bearing = compute_touch(hand, pose, shape, position, rotation, bare, skin, cover)
+        skin_force = jnp.sum(bearing.skin_force, -1)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -197,8 +207,8 @@ class Env:
             torque_limited=torque[1],
             pose=pose,
             finger_force=force,
-            normal_force=normal_force,
-            touch=touch,
+            normal_force=jnp.sum(pressed.force, -1),
+            touch=pressed if skin.total == "pressing" else touch,
             tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, skin_force, delta),
             object_position=position,
             object_quat=quat,
@@ -207,31 +217,6 @@ class Env:
             action=action,
             last_action=last_action,
         )
-
-    def _feel(
-        self,
-        pose: HandPose,
-        object: ObjectParams,
-        place: tuple[jax.Array, jax.Array],
-        force: jax.Array,
-        pad_thickness_delta: jax.Array,
-    ) -> tuple[Touch, jax.Array, jax.Array]:
-        """What the fingertips feel of an object at `place` (position [3] m, rotation [3, 3]) that presses with `force`
-        [F, 3] N, palm frame: depths and forces of the taxels; the part [F] N of `force` that presses into the skin; the
-        force [F] N, by the skin's law, for the contact's springs."""
-        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
-        geometry = self.touch_geometry(object)
-        touch = compute_touch(hand, pose, geometry, *place, length(force), skin, pad_thickness_delta)
-        # In the links' frames, where the normals are constants.
-        local = rotations.rotate_inverse(pose.tip_rotation, force)
-        pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
-        normal = jnp.sum(pressed.force, -1)
-        touch = pressed if skin.total == "pressing" else touch
-        if self.config.touch_method == "closed_form" and skin.margin == thickness:
-            return touch, normal, jnp.sum(touch.skin_force, -1)  # the springs' geometry and rubber
-        delta = jnp.maximum(pad_thickness_delta, -thickness)  # the solver's
-        bearing = compute_touch(hand, pose, object.shape(), *place, jnp.ones(hand.num_fingers), skin, delta)
-        return touch, normal, jnp.sum(bearing.skin_force, -1)
 
     def _observe(
         self, key: jax.Array, episode: Episode, command: JointCommand, goal: Any, truth: GroundTruth, last: State | None

@@ -69,7 +69,7 @@ class SensorSuite:
         age = hand.sensing_latency
         late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, now, before)
         keys = jax.random.split(key, 5)
-        joints = late.joint_position + hand.encoder_bias
+        joints = late.joint_position + hand.actuator.encoder_bias
         joints = joints + sensing.joint_noise * jax.random.normal(keys[0], joints.shape)
         if sensing.joint_resolution > 0:
             joints = jnp.round(joints / sensing.joint_resolution) * sensing.joint_resolution
@@ -101,12 +101,8 @@ class SensorSuite:
         the truth and of the goal as `Task.goal_readings` gives it."""
         true = dataclasses.replace(
             readings,
-            joint_position=truth.joint_position,
-            joint_torque=truth.joint_torque / self.hand.torque_limit,
-            taxel_force=truth.touch.force,
-            object_position=truth.object_position,
+            **vars(self.input(truth)),
             object_velocity=truth.object_velocity,
-            object_quat=truth.object_quat,
             command=goal[0],
             goal_quat=goal[1],
         )

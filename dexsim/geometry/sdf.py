@@ -5,12 +5,13 @@ Distances are negative inside, and exact but for points inside an overlap of sev
 depth below the nearest of their surfaces, not below the outer one.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
 from dexsim.core.pytree import Array, pytree_dataclass, static
 
-KINDS = ("sphere", "box", "capsule", "cylinder")
 FAR = 1e3  # m, the distance to a primitive that is switched off
 _TINY = 1e-20  # keeps the gradient of a norm finite at zero
 
@@ -50,12 +51,8 @@ def cylinder(point: Array, size: Array) -> jax.Array:
     return outside + jnp.minimum(jnp.maximum(radial, axial), 0.0)
 
 
-_DISTANCE = {"sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder}
-
-
-def primitive_distance(kind: str, points: Array, size: Array) -> jax.Array:
-    """Distance [...] m from `points` [..., 3] to one primitive in its own frame."""
-    return _DISTANCE[kind](points, size)
+DISTANCE = {"sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder}
+"""Distance [...] m from points [..., 3] to one primitive of a size [3] in its own frame, by its kind."""
 
 
 def signed_distance(points: Array, shape: Shape) -> jax.Array:
@@ -63,12 +60,9 @@ def signed_distance(points: Array, shape: Shape) -> jax.Array:
 
     def one(k: int) -> jax.Array:
         local = to_local(points, shape.position[k], shape.rotation[k])
-        return jnp.where(shape.active[k], primitive_distance(shape.kinds[k], local, shape.size[k]), FAR)
+        return jnp.where(shape.active[k], DISTANCE[shape.kinds[k]](local, shape.size[k]), FAR)
 
-    distance = one(0)
-    for k in range(1, len(shape.kinds)):
-        distance = jnp.minimum(distance, one(k))
-    return distance
+    return functools.reduce(jnp.minimum, map(one, range(len(shape.kinds))))
 
 
 def to_local(points: Array, position: Array, rotation: Array) -> jax.Array:

@@ -54,7 +54,7 @@ def from_shape(shape: sdf.Shape, count: int = COUNT) -> SurfacePoints:
         for other, name in enumerate(shape.kinds):
             if other != k:
                 inside = sdf.to_local(place, shape.position[other], shape.rotation[other])
-                buried |= shape.active[other] & (sdf.primitive_distance(name, inside, shape.size[other]) < 0)
+                buried |= shape.active[other] & (sdf.DISTANCE[name](inside, shape.size[other]) < 0)
         position.append(jnp.where((buried | ~shape.active[k])[:, None], _OUT_OF_THE_WAY, place))
         normal.append(jnp.einsum("ij,nj->ni", turn, out, precision="highest"))
     return SurfacePoints(jnp.concatenate(position), jnp.concatenate(normal))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dexsim.core.errors import AssetError
-from dexsim.hand.fit import unit
+from dexsim.hand.description import unit
 from dexsim.hand.vendor import Draft, Link
 
 _FLEXION = 0.7  # cosine to the axis of a finger's last joint above which another joint flexes, too

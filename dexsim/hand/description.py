@@ -93,6 +93,11 @@ class Hand:
         return self.taxel_position.shape[1]
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] of length one."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
 def primitive_mesh(kind: str, size: np.ndarray) -> Any:
     """A primitive as a `trimesh.Trimesh`; `size` as in MuJoCo, m."""
     import trimesh

@@ -61,11 +61,6 @@ def fit_palm(surface: Any) -> PalmBox:
     return PalmBox((low + high) / 2, half, float(beyond))
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] of length one."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
 def segment_distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distance [...] m of points [..., 3] from the segment between a and b [..., 3]."""
     arm, span = points - a, b - a

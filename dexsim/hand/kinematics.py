@@ -6,7 +6,7 @@ import numpy as np
 
 from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.geometry import rotations
-from dexsim.hand.description import Hand
+from dexsim.hand.description import Hand, unit
 
 
 @pytree_dataclass
@@ -108,8 +108,7 @@ def fingertip_strength(hand: Hand, joint_position: Array) -> np.ndarray:
     def pads(joints: Array) -> jax.Array:
         return taxel_positions(hand, forward_kinematics(hand, joints)).mean(1)
 
-    facing = np.array(taxel_normals(hand, forward_kinematics(hand, joint_position)).mean(1))
-    facing /= np.linalg.norm(facing, axis=-1, keepdims=True)
+    facing = unit(np.asarray(taxel_normals(hand, forward_kinematics(hand, joint_position)).mean(1)))
     lever = np.abs(np.einsum("fk,fkj->fj", facing, jax.jit(jax.jacfwd(pads))(joint_position)))
     return (hand.torque_limit / np.maximum(lever, 1e-6)).min(-1)
 

@@ -29,9 +29,8 @@ def read_mjcf(hand: Hand) -> mujoco.MjSpec:
     frame, palm = (_pose(data.body(name)) for name in (root.name, hand.palm))
     if not np.array_equal(palm, np.eye(4)):
         # The root is at frame @ place, and its palm at frame @ place @ (inverse of frame @ palm): that is to be 1.
-        place, quat = np.linalg.inv(frame) @ np.linalg.inv(palm) @ frame, np.empty(4)
-        mujoco.mju_mat2Quat(quat, place[:3, :3].ravel())
-        root.pos, root.quat = place[:3, 3], quat
+        place = np.linalg.inv(frame) @ np.linalg.inv(palm) @ frame
+        root.pos, root.quat = place[:3, 3], quaternion(place[:3, :3])
     _write_down_masses(spec, model)
     return spec
 
@@ -46,6 +45,13 @@ def _write_down_masses(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             body.explicitinertial, body.mass, body.inertia = True, model.body_mass[body.id], model.body_inertia[body.id]
             body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
             body.fullinertia[0], body.ialt.type = np.nan, mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix [3, 3]."""
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.asarray(rotation, float).ravel())
+    return quat
 
 
 def _pose(body: Any) -> np.ndarray:

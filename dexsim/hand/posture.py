@@ -7,8 +7,8 @@ import itertools
 
 import numpy as np
 
-from dexsim.hand.description import Hand
-from dexsim.hand.fit import segment_distance, unit
+from dexsim.hand.description import Hand, unit
+from dexsim.hand.fit import segment_distance
 from dexsim.hand.kinematics import finger_bodies, flexion_joints, open_hand
 from dexsim.hand.mjcf import hand_poses
 

@@ -98,7 +98,10 @@ def read_hand(
         spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
         if spec.tendons:
             _drop_tendons(spec, drop_tendons)
-        links = _read_links(spec.compile(), palm, freeze, couple, _urdf_speeds(root), notes)
+        # Velocity limits, which MuJoCo does not read.
+        limits = [(joint.get("name", ""), limit) for joint in root.findall("joint") for limit in joint.findall("limit")]
+        speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits}
+        links = _read_links(spec.compile(), palm, freeze, couple, speeds, notes)
         for link in links:
             if link.surface is not None and np.max(link.surface.extents) > _LARGEST:
                 long = f"link {link.name} is {np.max(link.surface.extents):.0f} m long"
@@ -167,12 +170,6 @@ def _find_file(path: Path, name: str) -> Path:
     names = [Path(*rest.parts[1:]), rest] if name.startswith("package://") else [rest]
     places = [path.parent / rest, *(folder / part for part in names for folder in path.resolve().parents)]
     return next((place for place in places if place.is_file()), places[0])
-
-
-def _urdf_speeds(root: ElementTree.Element) -> dict[str, float]:
-    """Velocity limits, which MuJoCo does not read."""
-    limits = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
-    return {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
 
 
 def _tensor(inertia: ElementTree.Element | None) -> np.ndarray:

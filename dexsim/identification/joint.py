@@ -87,7 +87,14 @@ def simulate(
     acting = target[jnp.clip(index // substeps, 0)].reshape(count, substeps)
     before = jnp.concatenate([acting[:1, 0], acting[:-1, -1]])
     rate = values["inertia"] / timestep
-    motor = functools.partial(_blurred_torque, blur) if blur > 0 else _torque
+
+    def motor(target: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+        if not blur:
+            return joint_torque(drive, target, 0.0, position, velocity)
+        error = target - (position + values["encoder_bias"])
+        share = jax.nn.sigmoid((jnp.abs(error) - drive.dead_band) * (4.0 / blur))
+        torque, limit = share * pd_torque(drive, error, 0.0, 0.0, velocity), torque_limit(drive, velocity)
+        return drive.efficiency * jnp.clip(torque, -limit, limit)
 
     segment = jnp.zeros(count, jnp.int32) if segment is None else segment
     begins = jnp.concatenate([jnp.ones(1, bool), segment[1:] != segment[:-1]])
@@ -97,9 +104,9 @@ def simulate(
         position, velocity = state
         target_of, last, begin, start = inputs
         position, velocity = jnp.where(begin, start, position), jnp.where(begin, 0.0, velocity)
-        reading = (position + values["encoder_bias"], motor(drive, last, position, velocity))
+        reading = (position + values["encoder_bias"], motor(last, position, velocity))
         for substep in range(substeps):
-            torque = motor(drive, target_of[substep], position, velocity)
+            torque = motor(target_of[substep], position, velocity)
             torque = torque - (values["gravity_cos"] * jnp.cos(position) + values["gravity_sin"] * jnp.sin(position))
             velocity = velocity + apply_friction(drive, torque, velocity, rate) / rate
             position = position + timestep * velocity
@@ -107,22 +114,6 @@ def simulate(
 
     rest = (starts[0], jnp.zeros_like(starts[0]))
     return jax.lax.scan(tick, rest, (acting, before, begins, starts))[1]
-
-
-def _torque(drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
-    return joint_torque(drive, target, 0.0, position, velocity)
-
-
-def _blurred_torque(
-    blur: float, drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array
-) -> jax.Array:
-    """`joint_torque` with a dead-band that fades in over `blur` rad."""
-    assert drive.encoder_bias is not None  # one of `PARAMETERS`
-    error = target - (position + drive.encoder_bias)
-    share = jax.nn.sigmoid((jnp.abs(error) - drive.dead_band) * (4.0 / blur))
-    torque = share * pd_torque(drive, error, 0.0, 0.0, velocity)
-    limit = torque_limit(drive, velocity)
-    return drive.efficiency * jnp.clip(torque, -limit, limit)
 
 
 def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarray, np.ndarray]:

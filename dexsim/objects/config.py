@@ -89,7 +89,7 @@ class ObjectConfig(Config):
     def slots(self) -> tuple[str, ...]:
         """Primitives of the compiled template: those that its shapes need."""
         if self.mesh:
-            return load_mesh_object(self).kinds
+            return ("box",) * len(load_mesh_object(self).boxes.size)
         needed = {slot for shape in self.shapes for slot in _SLOTS_OF[shape]}
         return tuple(slot for slot in SLOTS if slot in needed)
 

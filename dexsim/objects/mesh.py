@@ -17,13 +17,13 @@ from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
 
 from dexsim.core.assets import cached_arrays
 from dexsim.core.errors import AssetError
 from dexsim.geometry import mesh as meshes, rotations, sdf
+from dexsim.hand.mjcf import quaternion
 
 _ALIGNED = 0.01  # products of inertia below this share of the mean moment are none
 _VERSION = 3  # of the files in the cache
@@ -62,11 +62,6 @@ class MeshObject:
     mesh: meshes.Trimesh
     boxes: Boxes
     inertia: np.ndarray  # [3] m^2, of a uniform solid of 1 kg
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The primitives that it consists of."""
-        return ("box",) * len(self.boxes.size)
 
 
 @lru_cache(maxsize=8)
@@ -138,9 +133,8 @@ def _fit(mesh: meshes.Trimesh, parts: int, frames: Sequence[np.ndarray]) -> Boxe
 def _start(mesh: meshes.Trimesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> np.ndarray:
     """Boxes along the columns of `frame` [K, 10]: position, logarithms of the half-extents, quaternion."""
     low, high = _grow(meshes.make_mesh("", mesh.vertices @ frame, mesh.faces), parts, rng)
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(frame, np.float64).ravel())
-    return np.column_stack([(low + high) / 2 @ frame.T, np.log((high - low) / 2), np.tile(quat, (len(low), 1))])
+    quats = np.tile(quaternion(frame), (len(low), 1))
+    return np.column_stack([(low + high) / 2 @ frame.T, np.log((high - low) / 2), quats])
 
 
 def _grow(mesh: meshes.Trimesh, parts: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -89,18 +89,19 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
       AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
     keys, extreme, quat = jax.random.split(key, 8), sample_extreme(key, config.extremes), None
+    kinds = config.slots
     if config.mesh:
         mesh_object = load_mesh_object(config)
         boxes, factor = mesh_object.boxes, uniform(keys[1], config.mesh_size, extreme)
         size, position = factor * jnp.asarray(boxes.size), factor * jnp.asarray(boxes.position)
         quat, active = jnp.asarray(boxes.quat), jnp.ones(len(size), bool)
-        shape_index, kinds = jnp.int32(KINDS.index("mesh")), mesh_object.kinds
+        shape_index = jnp.int32(KINDS.index("mesh"))
         plain = factor**2 * jnp.asarray(mesh_object.inertia)
     else:
         if shape_index is None:
             allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
             shape_index = jax.random.choice(keys[0], allowed)
-        shape_index, kinds = shape_index.astype(jnp.int32), config.slots
+        shape_index = shape_index.astype(jnp.int32)
         slots = np.array([SLOTS.index(slot) for slot in kinds])
         size, position, active = (part[slots] for part in _sample_slots(keys[1], shape_index, config, extreme))
         mass, com, inertia = _mass_properties(kinds, size, position, active)

@@ -85,7 +85,6 @@ class Backend(Protocol):
         Returns:
           The world after the tick. Forces are NaN where the engine could not keep all contacts.
         """
-        ...
 
 
 def places(scene: PhysicsScene) -> dict[str, Any]:

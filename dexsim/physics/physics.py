@@ -192,7 +192,7 @@ class Physics:
         depth: jax.Array | float = 0.0
         for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
             here = sdf.to_local(local, shape.position[k], shape.rotation[k])
-            gap = sdf.primitive_distance(kind, here, shape.size[k])
+            gap = sdf.DISTANCE[kind](here, shape.size[k])
             depth += jnp.where(shape.active[k], jnp.maximum(radius - gap, 0.0), 0.0)
         nominal = contact.NOMINAL * contact.ROW_SHARE
         blend = nominal * contact.BLEND_DEPTH

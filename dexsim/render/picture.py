@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from dexsim.hand.description import Hand
-from dexsim.hand.mjcf import Pose
+from dexsim.hand.description import Hand, unit
+from dexsim.hand.mjcf import Pose, quaternion
 from dexsim.render.panel import force_color
 
 # Of hand, object and goal, in the live view too: sRGB bytes.
@@ -102,11 +102,6 @@ def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> CameraV
     return CameraView(origin, axes, float(scale), (width, height))
 
 
-def unit(vector: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] of length one."""
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
-
-
 def linear(color: Color) -> tuple[float, float, float]:
     """A colour as linear light in [0, 1]."""
     red, green, blue = (np.asarray(color) / 255) ** 2.2
@@ -141,7 +136,7 @@ def draw_scene(
     force_range: float,
 ) -> np.ndarray:
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
-    canvas = _Canvas(camera, size)
+    canvas = Canvas(camera, size)
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
     links, front = canvas.cast(body), canvas.cast(held)
     canvas.paint(body, links, links.primitive >= 0)
@@ -194,25 +189,7 @@ def goal_position(camera: Camera) -> np.ndarray:
     return np.asarray(camera.target) + _GOAL_AT @ look(camera, (2, 2)).axes[:2]
 
 
-def cast(primitives: Primitives, view: CameraView, rays: np.ndarray) -> Surface:
-    """The nearest primitive along every one of a view's `rays` [H, W, 3]."""
-    spec, count = mujoco.MjSpec(), rays.shape[0] * rays.shape[1]
-    quat = np.empty(4)
-    for kind, size, position, rotation in zip(*primitives[:4], strict=True):
-        mujoco.mju_mat2Quat(quat, np.asarray(rotation, float).ravel())
-        shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
-        spec.worldbody.add_geom(type=shape, size=np.maximum(size, 1e-6), pos=position, quat=quat)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    index, distance, normal = np.full(count, -1, np.int32), np.empty(count), np.empty(3 * count)
-    origin = np.asarray(view.origin, float)
-    mujoco.mj_multiRay(model, data, origin, rays.ravel(), None, True, -1, index, distance, normal, count, _FAR)
-    index, depth = index.reshape(rays.shape[:2]), distance.reshape(rays.shape[:2])
-    return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
-
-
-class _Canvas:
+class Canvas:
     """A picture as it is painted, in linear light [H, W, 3], a colour for each of its rays."""
 
     def __init__(self, camera: Camera, size: tuple[int, int]):
@@ -224,7 +201,19 @@ class _Canvas:
 
     def cast(self, primitives: Primitives) -> Surface:
         """What of these each ray sees first."""
-        return cast(primitives, self.view, self.rays)
+        spec, rays = mujoco.MjSpec(), self.rays
+        for kind, size, position, rotation in zip(*primitives[:4], strict=True):
+            shape, quat = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), quaternion(rotation)
+            spec.worldbody.add_geom(type=shape, size=np.maximum(size, 1e-6), pos=position, quat=quat)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        count = rays.shape[0] * rays.shape[1]
+        index, distance, normal = np.full(count, -1, np.int32), np.empty(count), np.empty(3 * count)
+        origin = self.view.origin
+        mujoco.mj_multiRay(model, data, origin, rays.ravel(), None, True, -1, index, distance, normal, count, _FAR)
+        index, depth = index.reshape(rays.shape[:2]), distance.reshape(rays.shape[:2])
+        return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
 
     def paint(self, primitives: Primitives, surface: Surface, seen: np.ndarray, opacity: float = 1.0) -> None:
         """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the

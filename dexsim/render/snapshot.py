@@ -29,5 +29,4 @@ class Snapshot:
 
     def map(self, change: Callable[[Any], Any]) -> "Snapshot":
         """With every array changed, such as `stacked.map(lambda x: x[0])`."""
-        arrays = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return Snapshot(**{name: None if array is None else change(array) for name, array in arrays.items()})
+        return Snapshot(**{name: None if array is None else change(array) for name, array in vars(self).items()})

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, Range, setting
+from dexsim.core.ranges import uniform
 
 DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 """Effects that are drawn at every episode start where they have a range."""
@@ -90,15 +91,16 @@ class TaxelArray:
         for name in DRAWN[:-1]:
             if (span := getattr(sensor, name)) is not None:
                 shape, nominal = {"gain": each, "bias": each, "dead": ()}.get(name, finger), float(name == "gain")
-                params[name] = nominal + scale * (_uniform(keys[name], span, shape) - nominal)
+                params[name] = nominal + scale * (uniform(keys[name], span, None, shape) - nominal)
         if "hysteresis" in params:
-            params["memory"] = jnp.exp(-self.control_period / _uniform(keys["time"], sensor.hysteresis_time, finger))
+            time = uniform(keys["time"], sensor.hysteresis_time, None, finger)
+            params["memory"] = jnp.exp(-self.control_period / time)
         if "drift" in params:
             params["drift"] *= self.control_period**0.5
         if "dead" in params:
             params["alive"] = jax.random.uniform(keys["alive"], each) >= params.pop("dead")
         if sensor.rate is not None:
-            params["rate"] = self.control_period * _uniform(keys["rate"], sensor.rate, ())
+            params["rate"] = self.control_period * uniform(keys["rate"], sensor.rate, None)
             params["phase"] = jax.random.uniform(keys["phase"], ())
         return params
 
@@ -153,7 +155,3 @@ def neighbour_difference(force: jax.Array, grid: tuple[int, int]) -> jax.Array:
     wide = jnp.pad(map_, [(0, 0)] * (map_.ndim - 2) + [(1, 1)] * 2, mode="edge")
     around = wide[..., :-2, 1:-1] + wide[..., 2:, 1:-1] + wide[..., 1:-1, :-2] + wide[..., 1:-1, 2:]
     return (around - 4 * map_).reshape(force.shape)
-
-
-def _uniform(key: jax.Array, span: Range, shape: tuple[int, ...]) -> jax.Array:
-    return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])

@@ -6,12 +6,11 @@ Geometry is sent once and then moved; a frame costs a few kilobytes.
 import dataclasses
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import trimesh
 
 from dexsim.hand.description import Hand, primitive_mesh
-from dexsim.hand.mjcf import Pose, hand_poses
+from dexsim.hand.mjcf import Pose, hand_poses, quaternion
 from dexsim.render.panel import force_color
 from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, look
 from dexsim.render.render import camera_of
@@ -154,10 +153,3 @@ def box_faces(box: trimesh.Trimesh) -> list[tuple[Color, trimesh.Trimesh]]:
     axis = np.abs(box.face_normals).argmax(-1)
     side = 2 * axis + (box.face_normals[np.arange(len(axis)), axis] < 0)
     return [(FACES[k], box.submesh([np.flatnonzero(side == k)], append=True)) for k in range(6)]
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix [3, 3]."""
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.asarray(rotation, float).ravel())
-    return quat

@@ -31,11 +31,9 @@ class Source(Protocol):
 
     def add_controls(self, gui: Any) -> None:
         """Put what can be changed on the page, before anything else is asked for: `gui` is viser's."""
-        ...
 
     def episode(self) -> Iterator[Frame]:
         """The frames of a new episode, to its end."""
-        ...
 
 
 def frames_of(source: Source) -> Iterator[Frame]:

@@ -39,8 +39,7 @@ def _put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
     return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), x)
 
 
-if not hasattr(jax, "device_put_replicated"):
-    jax.device_put_replicated = _put_replicated
+jax.device_put_replicated = _put_replicated
 
 # brax sums each metric over the episode and keeps its own return and length.
 _RUNNING_METRICS = ("return", "length")

@@ -80,7 +80,6 @@ class GymVectorEnv(VectorEnv):
         `seed` is of each environment, or of the first, and one more for each that follows; without one the random
         numbers go on. `options` has no meaning here.
         """
-        del options
         if seed is None:
             seeds = self.np_random.integers(2**32, size=self.num_envs)
         elif isinstance(seed, (int, np.integer)):
@@ -90,7 +89,7 @@ class GymVectorEnv(VectorEnv):
             seeds = np.array(seed)
             super().reset(seed=int(seeds[0]))
         self._state = self._reset((seeds % 2**32).astype(np.uint32))
-        return self._observation(self._state), {}
+        return np.array(self._state.obs["actor"]), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control tick of all environments; `actions` [num_envs, A] are clipped to [-1, 1].
@@ -105,9 +104,9 @@ class GymVectorEnv(VectorEnv):
         terminated, truncated = np.array(seen.terminated), np.array(seen.truncated)
         done = terminated | truncated
         if self._same_step and done.any():
-            ends = {name: np.array(last.metrics[name]) for name in ("return", "length")}
-            info = {"final_obs": self._observation(last), "_final_obs": done, "final_info": ends, "_final_info": done}
-        return self._observation(self._state), np.array(seen.reward), terminated, truncated, info
+            ends, final = {name: np.array(last.metrics[name]) for name in ("return", "length")}, last.obs["actor"]
+            info = {"final_obs": np.array(final), "_final_obs": done, "final_info": ends, "_final_info": done}
+        return np.array(self._state.obs["actor"]), np.array(seen.reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8 [480, 640, 3] each: hand and object, and the forces of the taxels."""
@@ -124,9 +123,6 @@ class GymVectorEnv(VectorEnv):
         last = jax.vmap(self.env.step)(state, action)
         ended = last if self._same_step else state
         return jax.vmap(self.env.restart)(last, ended.terminated | ended.truncated), last
-
-    def _observation(self, state: Any) -> np.ndarray:
-        return np.array(state.obs["actor"])
 
 
 class GymEnv(gymnasium.Env):

@@ -37,7 +37,7 @@ def quantities(hand, drawn):
         "viscous_friction": motors.viscous_friction,
         "latency": drawn.latency[:, :1] * TIMES["timestep"],
         "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
-        "encoder_bias": drawn.encoder_bias,
+        "encoder_bias": drawn.actuator.encoder_bias,
         "torque_gain": drawn.torque_gain,
         "taxel_gain": drawn.taxel_gain[..., 0],
         "gravity_tilt": drawn.tilt,

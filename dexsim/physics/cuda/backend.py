@@ -37,17 +37,14 @@ class CudaBackend:
         joints = len(self.scene.joint_dof)
         recorded = record(law, jnp.zeros(joints))
         name, moving = self._load(print_law(recorded, joints)), (state.qpos, state.qvel, state.warmstart)
-        arguments = [*moving, *self._inputs(fields, push), *map(jnp.asarray, recorded.constants)]
+        inputs = fields | {"push": push, "pair_friction": fields["pair_friction"][:, 0]}
+        names = [buffer.name for buffer in buffers(self.scene, ()) if not buffer.output][len(moving) :]
+        given = [jnp.asarray(inputs[name], jnp.float32) for name in names]  # the same during the whole tick
+        arguments = [*moving, *given, *map(jnp.asarray, recorded.constants)]
         shapes = [array.shape for array in moving] + [(self.scene.hand.num_fingers, 3), (4,)]
         results = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
         qpos, qvel, warmstart, force, _ = launch.call(name, results, *arguments)
         return StepResult(PhysicsState(qpos, qvel, warmstart), force)
-
-    def _inputs(self, fields: Fields, push: jax.Array) -> list[jax.Array]:
-        """What of a tick stays the same, in the order of the kernel's buffers."""
-        inputs = fields | {"push": push, "pair_friction": fields["pair_friction"][:, 0]}
-        names = [buffer.name for buffer in buffers(self.scene, ()) if not buffer.output][3:]
-        return [jnp.asarray(inputs[name], jnp.float32) for name in names]
 
     def _load(self, law: PrintedLaw) -> str:
         """The name of the kernel with this law, compiled and loaded."""

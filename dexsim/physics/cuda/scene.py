@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dexsim.core.errors import AssetError
+from dexsim.hand.load import rotation_matrix
 from dexsim.physics.interface import PhysicsScene
 
 LANES = 32
@@ -101,20 +102,14 @@ def buffers(scene: PhysicsScene, law: Sequence[Buffer]) -> list[Buffer]:
 
 
 def check_scene(scene: PhysicsScene) -> None:
-    """Raise AssetError with everything in a scene of `build_scene` that the kernel lacks."""
+    """Raise AssetError with everything that the kernel lacks in a scene of `build_scene`, of a hand of `load_hand`."""
     model = scene.model
-    joint = np.delete(np.arange(model.njnt), model.dof_jntid[scene.object_dof[0]])
     friction = model.pair_friction
     lacking = {
         f"{model.nv - 6} hinges (at most {LANES - 6})": model.nv > LANES,
-        "joints that are no hinges": (model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE).any(),
-        "bodies with several joints": (model.body_jntnum > 1).any(),
         "mocap bodies": model.nmocap,
-        "tendons": model.ntendon,
         "dry friction of joints": model.dof_frictionloss.any(),
         "gravity compensation": model.body_gravcomp.any(),
-        "equality constraints other than between joints": (model.eq_type != mujoco.mjtEq.mjEQ_JOINT).any(),
-        "coupled joints that are switched off": not model.eq_active0.all(),
         f"more than {LANES} coupled joints": model.neq > LANES,
         "contacts of another dimension than 3": (model.pair_dim != 3).any(),
         "margins or gaps of contacts": model.pair_margin.any() or model.pair_gap.any(),
@@ -192,13 +187,6 @@ def find_links(scene: PhysicsScene) -> Links:
             offset_rotation[hinge] = turn @ axes @ rotation_matrix([np.cos(zero / 2), 0, 0, np.sin(zero / 2)])
             link[body], rotation[body], place[body] = hinge, axes.T, -axes.T @ anchor
     return Links(link, rotation, place, parent, offset_rotation, offset_place)
-
-
-def rotation_matrix(quat: ArrayLike) -> np.ndarray:
-    """[3, 3] of a quaternion (w, x, y, z)."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
-    return matrix.reshape(3, 3)
 
 
 def _axes_along(axis: np.ndarray) -> np.ndarray:

@@ -103,7 +103,6 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
-        self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
@@ -221,7 +220,7 @@ class Grasp(Task):
         force = length(truth.finger_force)
         contact = force > _CONTACT
         target = self.target_force(goal)
-        torque = truth.joint_torque[self._roots]  # positive closes the finger; `dexsim check-hand` checks it
+        torque = truth.joint_torque[self.hand.root_joint]  # positive closes the finger; `dexsim check-hand` checks it
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers, too_much = self._finger_joints, jnp.maximum(force[1:] - (target + _MARGIN), 0.0)
@@ -234,7 +233,7 @@ class Grasp(Task):
             "torque": held * weights.torque * follows_torque,
             "alive": held * weights.alive,
             "overload": held * weights.overload * jnp.sum(too_much) / config.max_force,
-            "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
+            "spread": weights.spread * joint_spread(truth.joint_position[self.hand.root_joint[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),

@@ -234,7 +234,7 @@ class TestEpisodes:
         episode, objects = row(begun.episode, done), grasp_env.config.objects
         for value, nominal in (
             (episode.hand.actuator.stall_torque, hand.torque_limit),
-            (episode.hand.encoder_bias, 0),
+            (episode.hand.actuator.encoder_bias, 0),
             (episode.hand.tilt, 0),
             (episode.imu.bias, 0),
             (episode.taxels["gain"], 1),

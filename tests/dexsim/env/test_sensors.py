@@ -46,7 +46,7 @@ def read(hand):
         zero = jnp.zeros(())
         errors = SimpleNamespace(
             sensing_latency=age,
-            encoder_bias=jnp.linspace(-0.01, 0.01, 12),
+            actuator=SimpleNamespace(encoder_bias=jnp.linspace(-0.01, 0.01, 12)),
             torque_gain=jnp.full(12, 1.5),
             taxel_gain=jnp.ones(hand.taxel_area.shape),
             tilt=jnp.array([0.1, 0.0]),

@@ -11,6 +11,7 @@ from dexsim.geometry import sdf
 from dexsim.geometry.distance import distance_and_normal as measure
 
 EYE = np.eye(3, dtype=np.float32)
+KINDS = tuple(sdf.DISTANCE)
 SIZES = {
     "sphere": (0.031, 0, 0),
     "box": (0.02, 0.035, 0.012),
@@ -52,11 +53,11 @@ def probes(size, count=150, seed=0):
 
 def one(kind, size, position=(0, 0, 0), rotation=EYE):
     """A single primitive. All kinds are there and the others switched off, so that all share a compilation."""
-    count, at = len(sdf.KINDS), sdf.KINDS.index(kind)
+    count, at = len(KINDS), KINDS.index(kind)
     sizes = np.full((count, 3), 1e-4, np.float32)
     sizes[at] = size
     return sdf.Shape(
-        sdf.KINDS,
+        KINDS,
         sizes,
         np.tile(np.float32(position), (count, 1)),
         np.tile(np.float32(rotation), (count, 1, 1)),
@@ -81,7 +82,7 @@ def test_distance_and_outward_normal(kind, size):
     np.testing.assert_allclose(np.asarray(normal)[far], (way / np.linalg.norm(way, axis=1)[:, None])[far], atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", sdf.KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_finite_at_the_centre_and_on_the_axes(kind):
     size = np.array(SIZES[kind])
     points = np.concatenate([np.zeros((1, 3)), 0.01 * EYE, -0.05 * EYE, np.diag(size)]).astype(np.float32)

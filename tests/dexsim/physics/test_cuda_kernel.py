@@ -140,12 +140,9 @@ def test_lost_contacts_and_diverged_worlds_have_no_forces():
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ('name="c1" axis', 'name="c1" type="slide" axis', "joints that are no hinges.*backend mjx may"),
-        ('<joint name="c1"', '<joint axis="1 0 0"/><joint name="c1"', "bodies with several joints"),
-        ('name="c1" axis', 'name="c1" frictionloss="0.1" axis', "dry friction"),
+        ('name="c1" axis', 'name="c1" frictionloss="0.1" axis', "dry friction.*backend mjx may"),
         ('condim="3"', 'condim="4"', "dimension"),
         ('friction="0.4 0.4"', 'friction="0.4 0.5"', "depends on the direction"),
-        ("<equality>", '<equality><weld body1="a1" body2="b1"/>', "equality constraints"),
         ('<geom name="c1"', '<geom name="c1" type="cylinder"', "no contacts of .*cylinder 'c1' on capsule 'object_0'"),
     ],
 )

@@ -14,7 +14,7 @@ from dexsim.core.assets import asset_path
 from dexsim.datasets.episodes import read_episodes
 from dexsim.geometry import sdf
 from dexsim.render import picture, render
-from dexsim.render.picture import Camera, Primitives, cast, look
+from dexsim.render.picture import Camera, Canvas, Primitives, look
 
 KINDS = ("sphere", "box", "cylinder", "capsule")
 SIZES = {"sphere": [0.03, 0, 0], "box": [0.02, 0.03, 0.025], "cylinder": [0.02, 0.03, 0], "capsule": [0.015, 0.02, 0]}
@@ -41,12 +41,9 @@ def test_rays_hit_the_surface_with_outward_normals(kind):
     """Sizes, poses and the projection are MuJoCo's: by the distance functions that the taxels use."""
     size, place = np.float32(SIZES[kind]), np.float32([0.01, -0.02, 0.03])
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-    view = look(Camera(azimuth=40, elevation=30, distance=0.3), (120, 120))
-    rays = view.rays()
-    color = np.full((1, 6, 3), 0.5, np.float32)
-    surface = cast(
-        Primitives((kind,), size[None].astype(float), place[None].astype(float), turn[None], color), view, rays
-    )
+    canvas = Canvas(Camera(azimuth=40, elevation=30, distance=0.3), (60, 60))
+    view, rays, color = canvas.view, canvas.rays, np.full((1, 6, 3), 0.5, np.float32)
+    surface = canvas.cast(Primitives((kind,), size[None].astype(float), place[None].astype(float), turn[None], color))
     seen = surface.primitive == 0
     assert seen.sum() > 300 and np.all(surface.depth[~seen] == 1e6)
     seen &= np.cumsum(seen).reshape(seen.shape) <= 300  # as many of every kind: one compilation
