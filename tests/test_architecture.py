@@ -61,19 +61,19 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 14_570,  # goal: 12,500
+    "dexsim": 14_495,  # goal: 12,500
     "dexsim/core": 855,  # goal: 900
-    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_265,  # goal: 1,900
-    "dexsim/hand dexsim/objects": 2_610,  # goal: 1,900
-    "dexsim/physics": 2_345,  # goal: 2,200, and 1,300 of CUDA
-    "dexsim/env dexsim/tasks": 2_520,  # goal, with the roots: 3,200
-    ROOTS: 1_465,
-    "dexsim/calibration dexsim/identification": 1_445,  # goal: 1,500
-    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_075,  # goal: 1,900
+    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_260,  # goal: 1,900
+    "dexsim/hand dexsim/objects": 2_625,  # goal: 1,900
+    "dexsim/physics": 2_330,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/env dexsim/tasks": 2_495,  # goal, with the roots: 3,200
+    ROOTS: 1_460,
+    "dexsim/calibration dexsim/identification": 1_435,  # goal: 1,500
+    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_050,  # goal: 1,900
     "dexsim_ppo": 3_840,  # goal: 4,000
-    "dexsim_real": 8_570,  # goal: 6,500
+    "dexsim_real": 8_525,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 19_245,  # goal: 18,000
+    "tests": 19_315,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
