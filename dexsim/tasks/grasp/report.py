@@ -15,6 +15,11 @@ _UNITS = {"total_torque": "total_torque", "touching": "touching_fingers", "torqu
 """Names of what is not in N, by metric."""
 
 
+def window(seconds: float) -> tuple[float, float]:
+    """From when to when [s] after release the forces of a trial of this length count."""
+    return min(SETTLE, seconds / 2), seconds
+
+
 def summarize(
     metrics: dict[str, np.ndarray],
     alive: np.ndarray,
@@ -41,14 +46,13 @@ def summarize(
       pressed. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
-    seconds = ticks * control_period
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
     # Of each episode [N], the mean over its late ticks.
     late_means = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in MEANS}
     report = {
         "episodes": episodes,
-        "seconds": seconds,
-        "window_s": [min(SETTLE, seconds / 2), seconds],
+        "seconds": ticks * control_period,
+        "window_s": list(window(ticks * control_period)),
         **reduce(metrics["command"][0], alive[-1], metrics["shape"][0].astype(int), late_means, span, shapes),
         "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
         "non_finite": int(metrics["non_finite"].sum()),
