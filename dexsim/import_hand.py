@@ -90,7 +90,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     """Write a maker's hand into a folder: the TOML, and whether it passes its checks."""
     name = re.sub(r"\W", "_", arguments.out.resolve().name)  # the folder's
     name = swap_sides(name) if arguments.mirror else name
-    check_new(folder, name)
+    check_new(folder / f"{name}.toml", folder / f"{name}.xml")
     draft = read_hand(
         arguments.file,
         palm=arguments.palm,

@@ -73,7 +73,7 @@ BUDGETS = {
     "dexsim_ppo": 3_840,  # goal: 4,000
     "dexsim_real": 8_525,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 19_315,  # goal: 18,000
+    "tests": 19_320,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

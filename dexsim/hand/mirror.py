@@ -154,13 +154,11 @@ def mirror_taxels(text: str) -> str:
     return "".join(",".join(row) + "\n" for row in (head, *rows))
 
 
-def check_new(folder: Path, name: str) -> Path:
-    """The TOML that a hand of this name gets. Raises AssetError: it or the MJCF exists, and may be edited."""
-    toml = folder / f"{name}.toml"
-    for path in (toml, toml.with_suffix(".xml")):
+def check_new(*paths: Path) -> None:
+    """Raise AssetError: one of these files exists, and somebody may have edited it."""
+    for path in paths:
         if path.exists():
             raise AssetError(f"{path}: exists; give another folder with --out")
-    return toml
 
 
 def write_mirror(path: Path, folder: Path) -> Path:
@@ -168,7 +166,7 @@ def write_mirror(path: Path, folder: Path) -> Path:
 
     Args:
       path: the hand's TOML.
-      folder: must not have a TOML or an MJCF of the new name.
+      folder: must not have any of the new files.
 
     Raises:
       AssetError: a file of the hand is missing or broken, or the new one exists.
@@ -176,18 +174,20 @@ def write_mirror(path: Path, folder: Path) -> Path:
     hand = load_hand(path)
     stem = swap_sides(path.stem)
     stem = f"{stem}_{OTHER[hand.side]}" if stem == path.stem else stem
-    toml = check_new(folder, stem)
+    toml, mjcf, layout = (folder / f"{stem}{end}" for end in (".toml", ".xml", "_taxels.csv"))
     text = path.read_text()
     model = ElementTree.fromstring(read_mjcf(hand.model_path))
+    parts = {folder / name: source for name, source in _gather_files(model, hand.model_path.parent)}
+    check_new(toml, mjcf, layout, *parts)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, source in _gather_files(model, hand.model_path.parent):
-        shutil.copyfile(source, folder / name)
+    for part, source in parts.items():
+        shutil.copyfile(source, part)
     mirror_mjcf(model)
     model.insert(0, ElementTree.Comment(f" Mirror image of {hand.model_path.name} in the plane y = 0. "))
     ElementTree.indent(model)
-    write_atomic(folder / f"{stem}.xml", [ElementTree.tostring(model) + b"\n"])
+    write_atomic(mjcf, [ElementTree.tostring(model) + b"\n"])
     if taxels := tomllib.loads(text).get("taxels"):
-        write_atomic(folder / f"{stem}_taxels.csv", [mirror_taxels((path.parent / taxels).read_text()).encode()])
+        write_atomic(layout, [mirror_taxels((path.parent / taxels).read_text()).encode()])
     write_atomic(toml, [mirror_toml(text, stem).encode()])
     return toml
 

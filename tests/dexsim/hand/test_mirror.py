@@ -155,8 +155,10 @@ def test_names_of_sides_are_words():
 
 def test_an_existing_hand_is_not_overwritten(tmp_path):
     write_mirror(find_hand(None), tmp_path)
-    with pytest.raises(AssetError, match="xhand_left.toml: exists; give another folder"):
-        write_mirror(find_hand(None), tmp_path)
+    for name in ("xhand_left.toml", "xhand_left.xml", "xhand_left_taxels.csv"):
+        with pytest.raises(AssetError, match=f"{name}: exists; give another folder"):
+            write_mirror(find_hand(None), tmp_path)
+        (tmp_path / name).unlink()
 
 
 def test_readings_are_mirrored_as_rotations_and_vectors_are(hand):
