@@ -53,7 +53,7 @@ TASKS: dict[str, TaskEntry] = {
     "rotate_any": TaskEntry(Rotate, rotate.any_object),
     "rotate_clear": TaskEntry(Rotate, rotate.clear_of_palm),
 }
-_OURS = tuple(TASKS)
+OURS = tuple(TASKS)
 _MODULES: dict[str, str] = {}  # that tasks were found in, by their names
 
 
@@ -97,7 +97,7 @@ def find_task(name: str) -> TaskEntry:
     """
     module, _, word = name.rpartition(":")
     if module:
-        if word in _OURS:
+        if word in OURS:
             raise ConfigError(f"task {name!r}: {word!r} is a task of dexsim; choose another name")
         try:
             makes = getattr(importlib.import_module(module), word, None)

@@ -8,6 +8,7 @@ import jax
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
+from dexsim.registry import OURS
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
@@ -111,7 +112,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
         raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     # A task of your own learns like the one whose configuration it extends.
     like = "grasp" if isinstance(env_config, GraspConfig) else "rotate" if isinstance(env_config, RotateConfig) else ""
-    preset = find_preset(device_preset() if name == "auto" else name, task if task.startswith(like) else like)
+    preset = find_preset(device_preset() if name == "auto" else name, task if task in OURS else like)
     if preset.minutes and hasattr(env_config, "trap"):  # Few steps: the first goals come after half as many without.
         env_config = replace(env_config, trap=0.0)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.

@@ -89,8 +89,9 @@ def test_a_task_of_your_own_learns_like_the_one_that_it_extends():
     class Still(RotateConfig):
         pass
 
-    own, parent = (preset_arguments(task, Still(), "cpu") for task in ("still", "rotate"))
-    assert own == dataclasses.replace(parent, task="still")
+    for name in ("still", "rotate_still"):
+        own, parent = (preset_arguments(task, Still(), "cpu") for task in (name, "rotate"))
+        assert own == dataclasses.replace(parent, task=name)
 
 
 def test_the_ranges_of_rotation_widen_after_five_goals_and_narrow_below_half_of_them():
