@@ -89,17 +89,18 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
     actor = (grads.actor, grads.log_std, grads.memory)
     (actor_grads, std_grads, memory_grads), actor_norm = clip_by_global_norm(actor, config.max_grad_norm)
     critic_grads, critic_norm = clip_by_global_norm(grads.critic, config.max_grad_norm)
-    rate, moves = learner.learning_rate, actor_learns(config, learner)
-    if config.critic_first:
-        rate = jnp.where(moves, rate, config.learning_rate_max)
     grads = Params(actor_grads, std_grads, critic_grads, memory_grads)
-    params, moments = step_adam(grads, learner.adam, learner.params, rate)
+    params, moments = step_adam(grads, learner.adam, learner.params, learner.learning_rate)
     # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
     params = dataclasses.replace(params, log_std=log_std)
-    if config.critic_first:  # Adam's moments already follow the gradient, so that the actor's first step is small.
+    if config.critic_first:
+        # Adam's moments follow the gradient from the start, so that the actor's first step is small. The critic keeps
+        # its rate: at the actor's it would fall behind, and the actor would climb its errors.
+        moves = actor_learns(config, learner)
         held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
-        params = dataclasses.replace(held, critic=params.critic)
+        quick, _ = step_adam(grads, learner.adam, learner.params, jnp.float32(config.learning_rate_max))
+        params = dataclasses.replace(held, critic=quick.critic)
     ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
     new = learner._replace(params=params, adam=moments)
     learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
