@@ -164,7 +164,12 @@ def bundle_config(policy: Policy, hand: Hand) -> dict[str, Any]:
         "hand": hand.name,
         "control_rate": policy.control_rate,
         "observation": [
-            {"name": entry.name, "size": entry.size, "unit": _UNITS[entry.name], "source": FIELDS[entry.name].source}
+            {
+                "name": entry.name,
+                "size": entry.size,
+                "unit": _UNITS.get(entry.name, "SI"),
+                "source": FIELDS[entry.name].source,
+            }
             for entry in policy.observation_layout
         ],
         "joints": [

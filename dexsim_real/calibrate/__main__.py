@@ -1,4 +1,4 @@
-"""Calibrates a hand by pressing its fingertips on something firm: currents to torques, taxel counts to newtons.
+"""Calibrates a hand by pressing its fingertips on a pen that foam backs: currents to torques, taxel counts to newtons.
 
     python -m dexsim_real.calibrate --port /dev/serial/by-id/usb-FTDI_... --output hand.toml
 
