@@ -13,15 +13,14 @@ from dexsim_real.wire.frames import Mode
 class FollowingHand(PtyHand):
     """Joints that go a third of the way to their target at each exchange; it keeps what was asked of it."""
 
-    def __init__(self, trouble=None, pause=0.0):
+    def __init__(self, trouble=lambda index, state: None):
         super().__init__(self._follow)
-        self.trouble, self.pause = trouble or (lambda index, state: None), pause
+        self.trouble = trouble
         self.times, self.poses = [], []
         self.state["joint"]["position"] = 0.1
         self.state["joint"]["position"][3] = 0.0
 
     def _follow(self, index, block, state):
-        time.sleep(self.pause)
         joint = state["joint"]
         self.times.append(time.monotonic())
         self.poses.append(joint["position"].copy())

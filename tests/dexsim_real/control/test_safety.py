@@ -304,13 +304,6 @@ def test_holds_for_force_with_a_short_pause_ease_by_a_tenth_of_a_radian_together
     np.testing.assert_allclose(last.position, MIDDLE - np.float32(eased) * FREE, atol=1e-3)
 
 
-def test_holds_for_a_fifth_of_the_time_never_turn_the_motors_off(bench):
-    for _ in range(25):
-        bench.run(0.5, target=MIDDLE, hold=UNSEEN)
-        bench.run(2.2, target=MIDDLE)
-    assert not bench.safety.latched
-
-
 # --- motors off ----------------------------------------------------------------------------------
 
 

@@ -253,22 +253,11 @@ def test_a_wrong_angle_in_a_hold_is_not_eased_to(held, case, seconds, far):
     assert on[: round(1.0 / CYCLE)].all() and not on[-1]
 
 
-def test_a_finger_that_is_pushed_gives_way(hand):
-    """By a tenth of a radian from where it was, at the speed of starts."""
-    bench = ready(hand)
-    commands = []
-    for _ in range(round(1.0 / CYCLE)):
-        bench.position = bench.position - np.float32(0.004) * JOINT
-        commands.append(bench.cycle(target=MIDDLE, follow=False, force=30.0).position[4] - MIDDLE[4])
-    assert np.abs(np.diff(commands)).max() <= 0.5 * CYCLE + 1e-6
-    assert commands[-1] == pytest.approx(-0.1, abs=0.005)
-
-
-@pytest.mark.parametrize(("share", "ended"), [(15, False), (30, True)])
+@pytest.mark.parametrize(("share", "ended"), [(18, False), (35, True)])
 def test_short_holds_may_take_a_fifth_of_the_time(hand, share, ended):
     """A policy that touches too hard now and then goes on."""
     bench = ready(hand)
-    for k in range(round(42.0 / CYCLE)):
+    for k in range(round(30.0 / CYCLE)):
         bench.cycle(target=MIDDLE, force=30.0 * (k % 100 < share))
         if bench.safety.latched:
             break

@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import os
 import re
 import termios
 import time
@@ -15,7 +14,7 @@ from pty_hand import QUICK, PtyHand
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
-from dexsim_real.core.errors import HandError, explain
+from dexsim_real.core.errors import HandError
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import Imu
@@ -228,12 +227,6 @@ def test_a_port_that_does_not_open_is_one_line(monkeypatch, error, says):
     for opening in (SerialHand("/dev/null", QUICK).connect, lambda: Imu("/dev/null")):
         with pytest.raises(HandError, match=f"^/dev/null: .*{says}[^\n]*$"):
             opening()
-
-
-def test_a_port_of_a_group_without_a_name_is_one_line(tmp_path):
-    (tmp_path / "tty").touch()
-    os.chown(tmp_path / "tty", -1, 54321)
-    assert "usermod -aG 54321" in explain(str(tmp_path / "tty"), PermissionError(errno.EACCES, "denied"))
 
 
 def test_the_latency_timer(tmp_path):
