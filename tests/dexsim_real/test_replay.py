@@ -107,16 +107,9 @@ def forged(folder):
     report = replay.Replay(path).report
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
     assert replay.main([str(path)]) == 1
-    for of, name, value in (
-        (Kind.TICK, "readings", 1.0),
-        (Kind.TICK, "sequence", [1]),
-        (Kind.META, "calibration", {"a": 1}),
-    ):
-        forge = lambda kind, content: {**content, name: value} if kind == of and name in content else content  # noqa: B023, E731
-        path = rewritten(folder, forge)
-        with pytest.raises(LogError, match=f"^{path}: invalid record") as error:
-            replay.Replay(path)
-        assert "\n" not in str(error.value)
+    path = rewritten(folder, lambda kind, content: {**content, "readings": 1.0} if kind == Kind.TICK else content)
+    with pytest.raises(LogError, match=f"^{path}: invalid record[^\n]*$"):
+        replay.Replay(path)
 
 
 def without_ticks(folder):

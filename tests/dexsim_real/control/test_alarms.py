@@ -244,21 +244,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
 # --- refusals ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("data", "serious", "text"),
-    [
-        ((1501028).to_bytes(4, "little"), True, "over-temperature (1501028)"),
-        ((1501035).to_bytes(4, "little") + b"\x04\x00", True, "over-current (1501035)"),
-        (b"\x1c\x00", True, "over-temperature (1501028)"),
-        (b"\x06", False, "busy (1501006)"),
-        (b"\xee\xee\xee\xee", False, "unknown error (ee ee ee ee)"),
-    ],
-)
-def test_an_error_frame_keeps_its_number(data, serious, text):
-    refusal = read_refusal(data)
-    assert refusal.serious == serious and text in refusal.text
-
-
 @pytest.mark.parametrize(("between", "fatal"), [("", True), ("busy", False), ("answer", False)])
 def test_serious_refusals_turn_the_motors_off_in_a_row_or_as_every_other_answer(hand, between, fatal):
     hot, alarms = read_refusal((1501028).to_bytes(4, "little")), Alarms(hand, SafetyConfig())

@@ -261,7 +261,7 @@ def test_a_firm_grasp_and_a_fast_joint_go_on_up_to_their_limits(bench, measureme
 @pytest.mark.parametrize(
     "event", [{"velocity": 25.0}, *({"target": np.where(np.arange(12) == 7, bad, 1)} for bad in (np.nan, -np.inf))]
 )
-def test_hold_keeps_the_last_confirmed_command(bench, event):
+def test_hold_keeps_the_last_confirmed_command_and_does_not_last_for_ever(bench, event):
     """The hand is pressed away from its command; hold keeps the command."""
     target = MIDDLE + np.float32(0.15) * FREE
     bench.run(1.0, target=target)
@@ -272,6 +272,8 @@ def test_hold_keeps_the_last_confirmed_command(bench, event):
         assert decision.reaction == Reaction.HOLD and decision.mode == Mode.POSITION
         np.testing.assert_array_equal(decision.position, target)
     assert bench.cycle(target=target).reaction < Reaction.HOLD
+    modes = [decision.mode != 0 for decision in bench.run(6.0, **{"target": target} | event)]
+    assert 4.7 <= sum(modes) * CYCLE < 4.8 and not modes[-1] and bench.safety.latched.endswith("for 5 s")
 
 
 def test_a_command_that_was_not_answered_is_not_held(bench):

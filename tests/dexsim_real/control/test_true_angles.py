@@ -62,20 +62,15 @@ class Hands:
 # What a hand reads instead of its true angles. `past` has those of all cycles since the connection.
 
 
-def spike(rng):
-    at, joint, size = rng.integers(12), rng.integers(12), rng.choice([-1, 1]) * rng.uniform(0.02, 0.6)
-    return lambda k, past: past[-1] + size * (np.arange(12) == joint) * (k == at)
-
-
 def huge(rng):
     at, joint, value = rng.integers(12), rng.integers(12), rng.choice([np.nan, 1e30, -1e30])
     return lambda k, past: np.where((np.arange(12) == joint) & (k == at), value, past[-1])
 
 
-def several(rng):
-    """Two to four equal ones, in a row or with true ones between them."""
+def spikes(rng):
+    """One to four equal ones, in a row or with true ones between them."""
     joint, size = rng.integers(12), rng.choice([-1, 1]) * rng.uniform(0.02, 0.6)
-    wrong = set(rng.integers(0, 15) + rng.permutation(6)[: rng.integers(2, 5)])
+    wrong = set(rng.integers(0, 15) + rng.permutation(6)[: rng.integers(1, 5)])
     return lambda k, past: past[-1] + size * (np.arange(12) == joint) * (k in wrong)
 
 
@@ -114,7 +109,7 @@ def swapped(rng):
     return read
 
 
-KINDS = (spike, huge, several, drift, stuck, noise, swapped)
+KINDS = (spikes, huge, drift, stuck, noise, swapped)
 
 
 def starts(hand, kinds):
@@ -264,16 +259,9 @@ def test_short_holds_may_take_a_fifth_of_the_time(hand, share, ended):
     assert bool(bench.safety.latched) == ended
 
 
-@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"target": np.full(12, np.nan)}])
-def test_no_hold_lasts_for_ever(hand, event):
-    bench = ready(hand)
-    modes = [decision.mode != 0 for decision in bench.run(8.0, **{"target": MIDDLE} | event)]
-    assert 4.98 <= sum(modes) * CYCLE < 5.1 and not modes[-1] and bench.safety.latched.endswith("for 5 s")
-
-
 RARE = 1e-3  # probability in a cycle that the cable comes out, and that a run ends and another begins
 LENGTH = 30  # answers in which the angles of a fault are wrong, some or all
-ANGLES = (spike, huge, several, drift, noise, swapped)
+ANGLES = (spikes, huge, drift, noise, swapped)
 # Faults of what is no angle: what a joint or 60 taxels of a fingertip read, and in how many answers.
 OTHERS = dict(temperature=(255, 1), current=(-3000, 5), joint_error=(4, 3), raw_position=(0, 3), taxel=(9, 10))
 

@@ -24,13 +24,6 @@ from dexsim_real.core.process import ignore_signals, stopping
 pytest.importorskip("serial")
 
 
-def runner(peer, folder, *without):
-    """As a shell starts what runs in the background: with Ctrl-C ignored."""
-    options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in without]
-    shell = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "dexsim_real.run"]
-    return subprocess.Popen([*shell, *options], cwd=ROOT, stderr=subprocess.PIPE)
-
-
 def wait(condition, seconds=60.0):
     until = time.monotonic() + seconds
     while not condition():
@@ -40,9 +33,11 @@ def wait(condition, seconds=60.0):
 
 @contextlib.contextmanager
 def moving(folder, *without):
-    """A runner whose motors are on, and its hand."""
+    """A runner whose motors are on, and its hand. As shells start what runs in the background: with Ctrl-C ignored."""
+    shell = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "dexsim_real.run"]
     with FollowingHand() as peer:
-        process = runner(peer, folder, *without)
+        options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in without]
+        process = subprocess.Popen([*shell, *options], cwd=ROOT, stderr=subprocess.PIPE)
         try:
             wait(lambda: peer.on().sum() > 60 or process.poll() is not None)
             assert process.poll() is None, process.stderr.read()

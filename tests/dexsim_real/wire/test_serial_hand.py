@@ -82,7 +82,7 @@ FAULTS = {
     (lambda state, whole: whole[:700] + whole[760:]): "corrupt",
     (lambda state, whole: b"\x55\xaa" * 50): "corrupt",
     (lambda state, whole: b""): "silent",
-    (lambda state, whole: Frame(0x80, 0xFE, Command.ERROR, b"\x46\x00").encode()): "refused",
+    (lambda state, whole: Frame(0x80, 0xFE, Command.ERROR, b"\xee" * 4).encode()): "refused",  # no known number
     (lambda state, whole: Frame(0x81, 0xFE, Command.EXCHANGE, state.tobytes()).encode()): "corrupt",  # another hand's
 }
 
