@@ -1,10 +1,8 @@
 """Alarms of the hand itself: heat, current, error bits, control mode, motion, refusals. Each names joint and finger."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
+from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, ready, sample
 
 from dexsim_real.control.alarms import Alarms, Lasting, joint_labels
 from dexsim_real.control.limits import SafetyConfig
@@ -16,12 +14,9 @@ ON = np.full(12, Mode.POSITION, np.uint8)
 JOINTS = np.arange(12)
 
 
-def cycle(bench, target=MIDDLE, *, read=None, follow=True, **fields):
-    """One exchange with other fields of the measurement; `read` [J] rad in place of the true angles."""
-    plain = sample(bench.now, bench.position if read is None else read)
-    measured = dataclasses.replace(plain.measured, **{"mode": ON, **fields})
-    bench.safety.update(dataclasses.replace(plain, measured=measured))
-    return bench.cycle(target=target, fresh=False, follow=follow)
+def cycle(bench, target=MIDDLE, **fields):
+    """One exchange with other fields of the measurement."""
+    return bench.cycle(target, **fields)
 
 
 def changed(base, index, value):
@@ -32,11 +27,7 @@ def changed(base, index, value):
 
 @pytest.fixture
 def bench(hand):
-    bench = Bench(hand)
-    bench.engage()
-    for _ in range(round(2.0 / CYCLE)):
-        cycle(bench)
-    return bench
+    return ready(hand)
 
 
 @pytest.mark.parametrize(("pause", "seconds"), [(0.05, 0.29 - 0.05 + 0.29), (0.15, 0.29)])

@@ -23,7 +23,9 @@ WAYS = pytest.mark.parametrize("way", [np.float32(1), np.float32(-1)])
 UNSEEN = "the object is out of sight"
 
 
-def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.5, temperature=35.0, generation=1):
+def sample(
+    time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.5, temperature=35.0, errors=0, mode=3, generation=1
+):
     taxels = np.zeros((5, 120), np.float32)
     taxels[:, 0] = force
     measured = HandMeasurement(
@@ -32,8 +34,8 @@ def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.5, tempe
         taxel_force=taxels,
         current=np.full(12, current, np.float32),
         temperature=np.full(18, temperature, np.float32),
-        errors=np.zeros((12, 3), np.uint16),
-        mode=np.full(12, Mode.POSITION, np.uint8),
+        errors=np.full((12, 3), errors, np.uint16),
+        mode=np.full(12, mode, np.uint8),
     )
     return HandSample(time, 0, generation, measured, np.full(12, velocity, np.float32), empty_state())
 
@@ -46,11 +48,12 @@ class Bench:
         self.safety = Safety(hand, SafetyConfig(**{"speed": 8.0, "margin": 0.0, **options}), self.notes.append)
         self.now, self.position = 10.0, MIDDLE
 
-    def cycle(self, target=None, fresh=True, follow=True, hold="", **measurement):
+    def cycle(self, target=None, fresh=True, follow=True, hold="", read=None, **measurement):
+        """One exchange; `read` [J] rad in place of the true angles."""
         if fresh:
             # A last bit of noise: angles that never change are a fault of their own.
             noise = np.float32(1e-7) * (round(self.now / CYCLE) % 2)
-            self.safety.update(sample(self.now, self.position + noise, **measurement))
+            self.safety.update(sample(self.now, self.position + noise if read is None else read, **measurement))
         if target is not None:
             self.safety.set_target(target, self.now, hold)
         decision = self.safety.decide(self.now)

@@ -168,7 +168,6 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
     ("options", "says"),
     [
         ({}, "either --calibration FILE, or --uncalibrated"),
-        ({"--uncalibrated": (), "--calibration": ("x.toml",)}, "either --calibration FILE, or --uncalibrated"),
         ({"--uncalibrated": (), "--command": ("1.5",)}, "between 0 and 1"),
         ({"--uncalibrated": (), "--imu-mount": ("0", "0", "0", "0")}, "is no orientation"),
         ({"--uncalibrated": ()}, "cannot ask for confirmation without a terminal"),

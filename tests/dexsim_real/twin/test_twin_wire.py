@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from emulated_plant import motors
 from hypothesis import given, strategies as st
 
 pytest.importorskip("serial")
@@ -20,10 +21,6 @@ from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
 from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, check_identity, read_identity
 
 
-def command(position=REST, mode=Mode.POSITION):
-    return frames.command_block(position, kp=100, ki=0, kd=0, torque_max=300, mode=mode)
-
-
 def ask(board, kind, data=b"", target=0x80):
     return board.answer(Frame(0xFE, target, kind, data))
 
@@ -31,15 +28,15 @@ def ask(board, kind, data=b"", target=0x80):
 def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
     plant = ScriptedPlant()
     board = Firmware(plant)
-    ids = command()
+    ids = motors(REST)
     ids["id"][4] = 9
-    broken = command()
+    broken = motors(REST)
     broken["position"][2] = np.nan
     for kind, data, number in (
         (Command.EXCHANGE, ids.tobytes(), 1),
         (Command.EXCHANGE, broken.tobytes(), 30),
-        (Command.EXCHANGE, command(mode=7).tobytes(), 67),
-        (Command.EXCHANGE, command(mode=5).tobytes(), 81),
+        (Command.EXCHANGE, motors(REST, mode=7).tobytes(), 67),
+        (Command.EXCHANGE, motors(REST, mode=5).tobytes(), 81),
         (Command.READ_REGISTER, b"\x63\x00", 30),
     ):
         answer = ask(board, kind, data)
@@ -80,7 +77,7 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
     board = Firmware(plant)
     for degrees, hot in ((85.0, False), (100.0, True), (89.0, True), (84.0, False)):
         plant.heat[4] = degrees
-        state = frames.decode(ask(board, Command.EXCHANGE, command().tobytes()).data)["joint"]
+        state = frames.decode(ask(board, Command.EXCHANGE, motors(REST).tobytes()).data)["joint"]
         modes = [0 if hot and joint == 4 else 3 for joint in range(12)]
         assert plant.motors["mode"].tolist() == modes == (state["raw_position"] & 0xF).tolist()
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]
@@ -97,9 +94,9 @@ def test_each_hand_tells_its_side_and_serial_number(hand):
 # --- the line ---------------------------------------------------------------------------------------
 
 
-def request(block=None):
+def request():
     """The bytes of an exchange."""
-    return Frame(0xFE, 0x80, Command.EXCHANGE, (command() if block is None else block).tobytes()).encode()
+    return Frame(0xFE, 0x80, Command.EXCHANGE, motors(REST).tobytes()).encode()
 
 
 class Cable:

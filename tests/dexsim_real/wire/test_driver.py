@@ -68,7 +68,6 @@ def test_a_state_arrives_in_si_units_and_a_command_leaves_in_them(leap):
     [
         ({"position": np.zeros(15)}, r"position has the shape \[15\], expected \[16\]"),
         ({"taxel_force": None}, r"taxel_force has the shape \[\], expected \[4, 48\]"),
-        ({"current": None}, "current has the shape"),
         ({"temperature": np.where(np.arange(16) == 3, np.nan, 30.0)}, "temperature is not finite"),
     ],
 )
