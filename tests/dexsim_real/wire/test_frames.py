@@ -59,17 +59,9 @@ def test_a_state_block_byte_for_byte():
 
 
 def test_a_host_does_not_take_its_own_echo_for_an_answer():
-    block = frames.command_block(np.zeros(12), kp=1, ki=0, kd=0, torque_max=1)
-    echo = b"".join(
-        Frame(0xFE, 0x80, command, data).encode()
-        for command, data in (
-            (Command.EXCHANGE, block.tobytes()),
-            (Command.VERSION, b""),
-            (Command.READ_REGISTER, b"\x14\0"),
-        )
-    )
-    parser = Parser(HAND_REPLIES)
-    assert parser.feed(echo, final=True) == []
+    requests = (Command.EXCHANGE, bytes(288)), (Command.VERSION, b""), (Command.READ_REGISTER, b"\x14\0")
+    echo = b"".join(Frame(0xFE, 0x80, command, data).encode() for command, data in requests)
+    assert Parser(HAND_REPLIES).feed(echo, final=True) == []
     assert len(Parser(HOST_REQUESTS).feed(echo)) == 3
 
 

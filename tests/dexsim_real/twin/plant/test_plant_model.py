@@ -7,7 +7,6 @@ from emulated_plant import IDEAL, QUIET, free, motors
 
 from dexsim.core.assets import asset_path
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant import emulated_hand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage
 from dexsim_real.twin.plant.hand_model import read_model
 from dexsim_real.twin.plant.parameters import GRAVITY, sample_trial
@@ -177,10 +176,3 @@ def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand)
         strength[contact.finger] += np.linalg.norm(contact.normal)
     assert strength.sum() > 2.0 and ours.stage is Stage.FREE
     assert np.all(felt[strength == 0] < 0.2) and felt.sum() > 0.5 * strength.sum()
-
-
-def test_a_hand_without_room_for_an_object_is_no_endless_search(hand, text, write, monkeypatch):
-    monkeypatch.setattr(emulated_hand, "_OBJECTS", 3)
-    path = write(text.replace("<worldbody>", '<worldbody><geom type="sphere" size="2"/>'))
-    with pytest.raises(HandError, match="trial 0: none of 3 objects had room"):
-        plant(hand, path)
