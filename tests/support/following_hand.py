@@ -6,7 +6,7 @@ import time
 import numpy as np
 from pty_hand import PtyHand
 
-from dexsim_real.core.log import LogReader
+from dexsim_real.core.log import LogReader, LogWriter
 from dexsim_real.wire.frames import Mode
 
 
@@ -21,6 +21,7 @@ class FollowingHand(PtyHand):
         self.state["joint"]["position"][3] = 0.0
 
     def _follow(self, index, block, state):
+        time.sleep(0)  # Lets the thread that waits for the answer go first.
         joint = state["joint"]
         self.times.append(time.monotonic())
         self.poses.append(joint["position"].copy())
@@ -47,3 +48,12 @@ def summary(folder):
 
 def records(folder, kind):
     return [record.content for record in LogReader(folder / "run.log") if record.kind == kind]
+
+
+def rewritten(source, path, change):
+    """A log with changed records; a change to None drops one."""
+    with LogWriter(path) as log:
+        for entry in LogReader(source):
+            if (new := change(entry)) is not None:
+                log.add(new.kind, new.content, new.time)
+    return path

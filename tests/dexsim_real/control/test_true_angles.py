@@ -282,25 +282,20 @@ class Faulty(HandPort):
         return self.hands.time
 
     def exchange(self, command):
-        if self._away:
-            return self._lost()
-        if self.rng.random() < RARE:
-            self._away = int(self.rng.integers(2, 150))
-        on = bool(command["mode"][0] == Mode.POSITION)
-        self._command = command["position"][None].astype(float), np.array([on]), command["kp"][:1] / KP
-        self._move()
-        return self._answer()
-
-    def _lost(self):
-        """The cable is out: the hand keeps to its last command. When it is back, its motors go off, and it sinks."""
-        self._away -= 1
-        if self._away:
+        """While the cable is out, the hand keeps to its last command. When it is back, its motors go off."""
+        if self._away == 1:
+            self.reconnections += 1
+            self._generation += 1
+            self.sink()
+        elif not self._away:
+            on = np.array([command["mode"][0] == Mode.POSITION])
+            self._command = command["position"][None].astype(float), on, command["kp"][:1] / KP
             self._move()
-            return None
-        self.reconnections += 1
-        self._generation += 1
-        self.sink()
-        return self._answer()
+            self._away = int(self.rng.integers(3, 151)) * (self.rng.random() < RARE)
+        else:
+            self._move()
+        self._away = max(self._away - 1, 0)
+        return None if self._away else self._answer()
 
     def sink(self):
         """The motors are off for a while."""

@@ -12,10 +12,9 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.shapes import SHAPES, product
-from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera, virtual_imu
+from dexsim_real.twin.plant.shapes import SHAPES
+from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera
 from dexsim_real.twin.wire import picture
 
 OPTICS = CameraConfig()
@@ -57,20 +56,6 @@ def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypa
     assert run.port.counts.answered == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
     assert heard[0] == pytest.approx(0.0096) and np.ptp(np.diff(heard)[40:] - 1 / RATE) < 1e-9
     assert json.loads(json.dumps(report)) == report
-
-
-def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
-    for tilt in (0.0, 0.12):
-        plant = EmulatedHand(
-            hand, "rotate", 1, kind="nominal", overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt}
-        )
-        port = VirtualPort(plant)
-        imu = virtual_imu(port, 1)
-        port.sleep(0.0901)
-        imu.calibrate(IDENTITY)
-        true = plant.measure_object()[1]
-        apart = 2 * math.acos(min(1.0, abs(float(product(imu.read()[1] * [1, -1, -1, -1], true)[0]))))
-        assert apart < 0.002
 
 
 def test_the_camera_measures_the_height(hand):
