@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, ready, sample
+from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, Lasting, joint_labels
 from dexsim_real.control.limits import SafetyConfig
@@ -23,11 +23,6 @@ def changed(base, index, value):
     array = np.array(base)
     array[index] = value
     return array
-
-
-@pytest.fixture
-def bench(hand):
-    return ready(hand)
 
 
 @pytest.mark.parametrize(("pause", "seconds"), [(0.05, 0.29 - 0.05 + 0.29), (0.15, 0.29)])

@@ -141,6 +141,9 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on_and_may_not_h
     run(loop, round(2.0 / CYCLE))
     assert loop.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
     assert loop.driven
+    loop.port.now = loop.port.silent_until
+    run(loop, 1)
+    assert not loop.driven, "it has answered"
     loop.stop()
     assert not loop.driven and loop.port.modes[-1] == Mode.PASSIVE
 

@@ -80,11 +80,6 @@ def ready(hand, **options):
     return bench
 
 
-@pytest.fixture
-def bench(hand):
-    return ready(hand)
-
-
 # --- motors on ---------------------------------------------------------------------------------
 
 

@@ -169,7 +169,6 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
     [
         ({}, "either --calibration FILE, or --uncalibrated"),
         ({"--uncalibrated": (), "--command": ("1.5",)}, "between 0 and 1"),
-        ({"--uncalibrated": (), "--imu-mount": ("0", "0", "0", "0")}, "is no orientation"),
         ({"--uncalibrated": ()}, "cannot ask for confirmation without a terminal"),
         ({"--uncalibrated": (), "--yes": (), "--fixed-object": ()}, "there is no such port"),
         ({"--uncalibrated": (), "--yes": (), "--port": None}, "--camera, or --fixed-object"),

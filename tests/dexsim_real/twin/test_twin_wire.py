@@ -94,9 +94,7 @@ def test_each_hand_tells_its_side_and_serial_number(hand):
 # --- the line ---------------------------------------------------------------------------------------
 
 
-def request():
-    """The bytes of an exchange."""
-    return Frame(0xFE, 0x80, Command.EXCHANGE, motors(REST).tobytes()).encode()
+REQUEST = Frame(0xFE, 0x80, Command.EXCHANGE, motors(REST).tobytes()).encode()  # of an exchange
 
 
 class Cable:
@@ -109,8 +107,6 @@ class Cable:
 
     def _catch_up(self, now):
         self.plant.advance(max(now - 1000.0 - self.plant.time, 1e-6))
-
-    # What the hand sees.
 
     def read(self):
         data = bytes(self.to_hand)
@@ -140,14 +136,14 @@ def test_an_exchange_takes_what_it_takes_on_the_hand_and_comes_in_pieces():
     cable, times = Cable(), []
     for _ in range(700):
         start = cable.now
-        pieces = cable.ask(request(), 0.012)
+        pieces = cable.ask(REQUEST, 0.012)
         (frame,) = Parser(HAND_REPLIES).feed(b"".join(data for _, data in pieces))
         assert frame.command == Command.EXCHANGE
         times.append(1e3 * (pieces[-1][0] - start))
     assert np.mean(times) == pytest.approx(9.59, abs=0.02) and np.percentile(times, 95) < 9.64
     assert 10.2 < max(times) < 10.8 and min(times) > 9.4
     assert cable.line.counts == {"requests": 700, "answers": 700}
-    pieces = cable.ask(request() + request())
+    pieces = cable.ask(REQUEST + REQUEST)
     ends = np.cumsum([len(data) for _, data in pieces])
     assert ends.tolist() == [510, 1020, 1530, 2040, 2217]  # A request while the board is at work is ignored.
     np.testing.assert_allclose(np.diff([when for when, _ in pieces]), np.diff(ends) * 10 / 3e6, atol=1e-9)
@@ -159,7 +155,7 @@ def test_noise_on_the_line_is_answered_with_silence(noise):
     cable = Cable()
     answered = cable.ask(noise, 0.05) != []
     assert answered <= (Parser(frames.HOST_REQUESTS).feed(noise) != [])
-    assert cable.ask(request(), 0.05) != []
+    assert cable.ask(REQUEST, 0.05) != []
 
 
 def test_a_terminal_has_its_name_until_it_closes_and_takes_nobody_elses(tmp_path):
