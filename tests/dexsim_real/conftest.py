@@ -4,7 +4,13 @@ import jax
 import numpy as np
 import pytest
 
+from dexsim import load_hand
 from dexsim_real.control.controller import Controller
+
+
+@pytest.fixture(scope="session")
+def leap():
+    return load_hand("leap_like")
 
 
 @pytest.fixture(scope="session")

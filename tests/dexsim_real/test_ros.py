@@ -10,7 +10,6 @@ import pytest
 import rclpy_stand_in
 from scripted_driver import ScriptedDriver
 
-from dexsim import load_hand
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real import ros
 
@@ -23,11 +22,6 @@ def follower(hand, measures=("currents", "taxels")):
     if "currents" in measures:
         driver.state.current[:] = -0.2
     return driver
-
-
-@pytest.fixture
-def leap():
-    return load_hand("leap_like")
 
 
 @pytest.fixture

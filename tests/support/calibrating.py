@@ -68,9 +68,6 @@ class Typist(io.StringIO):
     def readline(self):
         return self.lines.get()
 
-    def isatty(self):
-        return False
-
     def operator(self):
         return Operator(self, stream=self)
 

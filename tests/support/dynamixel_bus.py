@@ -55,8 +55,8 @@ class DynamixelBus:
     def put(self, motor, address, size, value):
         self.table[motor][address : address + size] = value.to_bytes(size, "little", signed=value < 0)
 
-    def get(self, motor, address, size, signed=False):
-        return int.from_bytes(self.table[motor][address : address + size], "little", signed=signed)
+    def get(self, motor, address, size):
+        return int.from_bytes(self.table[motor][address : address + size], "little")
 
     def close(self):
         os.close(self._far)

@@ -6,22 +6,22 @@ import time
 import numpy as np
 from pty_hand import PtyHand
 
-from dexsim_real.core.log import LogReader
+from dexsim_real.core.log import LogReader, LogWriter
 from dexsim_real.wire.frames import Mode
 
 
 class FollowingHand(PtyHand):
     """Joints that go a third of the way to their target at each exchange; it keeps what was asked of it."""
 
-    def __init__(self, trouble=None, pause=0.0):
+    def __init__(self, trouble=lambda index, state: None):
         super().__init__(self._follow)
-        self.trouble, self.pause = trouble or (lambda index, state: None), pause
+        self.trouble = trouble
         self.times, self.poses = [], []
         self.state["joint"]["position"] = 0.1
         self.state["joint"]["position"][3] = 0.0
 
     def _follow(self, index, block, state):
-        time.sleep(self.pause)
+        time.sleep(0)  # Lets the thread that waits for the answer go first.
         joint = state["joint"]
         self.times.append(time.monotonic())
         self.poses.append(joint["position"].copy())
@@ -48,3 +48,12 @@ def summary(folder):
 
 def records(folder, kind):
     return [record.content for record in LogReader(folder / "run.log") if record.kind == kind]
+
+
+def rewritten(source, path, change):
+    """A log with changed records; a change to None drops one."""
+    with LogWriter(path) as log:
+        for entry in LogReader(source):
+            if (new := change(entry)) is not None:
+                log.add(new.kind, new.content, new.time)
+    return path

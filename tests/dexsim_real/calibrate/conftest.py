@@ -12,7 +12,7 @@ def session(hand, tmp_path_factory):
     """The index pressed with pad and side: bench, arguments, log, what the terminal showed."""
     folder = tmp_path_factory.mktemp("press")
     bench = BenchHand(hand, plates(hand, "index pad", "index side"), dead=((1, 52), (1, 110)))
-    options, who = arguments(folder, plot=folder / "hand.png"), operator()
+    options, who = arguments(folder), operator()
     log = record(bench, hand, options, who)
     fit_and_report(options, hand, [log], who)
     return bench, options, log, who.out.getvalue()

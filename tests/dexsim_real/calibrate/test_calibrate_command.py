@@ -26,12 +26,10 @@ def test_options_that_do_not_go_together(tmp_path):
     log.write_text("precious")
     for options, says in (
         ({"port": None}, "--port for a hand, or --from-log"),
-        ({"from_log": (log,)}, "--port for a hand, or --from-log"),
         ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
         ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
         ({"gauge": True}, "--gauge needs answers, but --yes"),
         ({"joints": ("mid_joint1",)}, "--joints is only for --identify"),
-        ({"dead_band": True}, "--dead-band is only for --identify"),
         ({"identify": True, "fingers": ("index",)}, "--fingers is not for --identify"),
         ({"log": same}, "--log .*is the file of --output, too"),
         ({"port": None, "from_log": (log,), "output": log, "force": True}, "--output .*is the --from-log"),
@@ -95,7 +93,6 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
 def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session, tmp_path):
     """By what they begin with."""
     meta = next(entry.content for entry in LogReader(session[2]) if entry.kind == Kind.META)
-    hardware = meta["hardware"]
 
     def log_of(name, **values):
         with LogWriter(tmp_path / name) as log:
@@ -105,17 +102,12 @@ def test_logs_that_do_not_belong_together_or_are_of_something_else(hand, session
     ours = log_of("ours")
     for values, says in (
         ({"rate": 82.0}, "another --rate than the logs before: 82.0"),
-        ({"hardware": {**hardware, "taxel_floor": 2.0}}, "another --hardware options than the logs before"),
         ({"identity": ("2R32OTHER", "right")}, "another hand than the logs before: .*2R32OTHER"),
         ({"task": "grasp"}, "this is a log of 'grasp'; give one of 'calibrate'"),
     ):
         with pytest.raises(LogError, match=says):
             read_presses([ours, log_of(f"{list(values)[0]}.log", **values)], hand)
-    for name, kind, content, says in (
-        ("early", Kind.NOTE, "end: no answer", "ends before the hand was ready"),
-        ("forged", Kind.META, {"task": "calibrate"}, "KeyError"),
-    ):
-        with LogWriter(tmp_path / f"{name}.log") as log:
-            log.add(kind, content)
-        with pytest.raises(LogError, match=says):
-            read_presses([log.path], hand)
+    with LogWriter(tmp_path / "early.log") as log:
+        log.add(Kind.NOTE, "end: no answer")
+    with pytest.raises(LogError, match="ends before the hand was ready"):
+        read_presses([log.path], hand)

@@ -7,6 +7,7 @@ import numpy as np
 import press_bench
 import pytest
 from calibrating import arguments, off, operator
+from following_hand import rewritten
 from press_bench import BenchHand
 
 from dexsim.core.errors import CalibrationError
@@ -14,7 +15,7 @@ from dexsim_real.calibrate import identify_drives
 from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.calibrate.identify_drives import identify_hand, joint_log, read_joints, record
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.twin.virtual import ideal_calibration
 
 
@@ -37,15 +38,6 @@ def moved(hand, path, bench=None, **options):
 @pytest.fixture(scope="module")
 def recorded(hand, tmp_path_factory):
     return moved(hand, tmp_path_factory.mktemp("identify") / "whole.log")
-
-
-def rewritten(source, path, change):
-    """A log with changed records; a change to None drops one."""
-    with LogWriter(path) as log:
-        for entry in LogReader(source):
-            if (new := change(entry)) is not None:
-                log.add(new.kind, new.content, new.time)
-    return path
 
 
 def fitted_log(path, hand, calibration=None, signal="fit"):

@@ -73,7 +73,7 @@ def test_the_calibration_names_its_hand_and_dead_taxels(hand, session):
     # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
     notes = "\n".join(calibration.notes)
     assert "index: dead: column 4 row 4 read" in notes and "column 9 row 2" not in notes
-    assert "index side" in shown and options.plot.stat().st_size > 20_000
+    assert "index side" in shown
 
 
 def test_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
@@ -137,7 +137,8 @@ def scale(hand, tmp_path_factory):
     """The middle pressed on a kitchen scale; its taxels read 15 % too little."""
     bench = BenchHand(hand, plates(hand, "middle pad"), taxel_gain=[1, 1, 0.85, 1, 1])
     typist = Typist(lambda: bench.force[2])
-    options = arguments(tmp_path_factory.mktemp("scale"), fingers=("middle",), gauge=True, yes=False)
+    folder = tmp_path_factory.mktemp("scale")
+    options = arguments(folder, fingers=("middle",), gauge=True, yes=False, plot=folder / "hand.png")
     fit_and_report(options, hand, [record(bench, hand, options, typist.operator())], typist.operator())
     return bench, options, typist
 
@@ -146,6 +147,7 @@ def test_a_kitchen_scale_gives_the_newtons(hand, scale):
     """Without the scale all torques would be 15 % too small."""
     bench, options, typist = scale
     assert typist.read == 12 and "'five' is not a reading" in typist.getvalue()
+    assert options.plot.stat().st_size > 20_000
     calibration = load_calibration(options.output, hand)
     np.testing.assert_allclose(torque_constants(calibration)[0][:, 6:8], truth_of(bench)[:, 6:8], rtol=0.03)
     assert calibration.force_per_count[2] == pytest.approx(0.1 / 0.85, rel=0.02)

@@ -1,7 +1,5 @@
 """Alarms of the hand itself: heat, current, error bits, control mode, motion, refusals. Each names joint and finger."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
@@ -16,27 +14,15 @@ ON = np.full(12, Mode.POSITION, np.uint8)
 JOINTS = np.arange(12)
 
 
-def cycle(bench, target=MIDDLE, *, read=None, follow=True, **fields):
-    """One exchange with other fields of the measurement; `read` [J] rad in place of the true angles."""
-    plain = sample(bench.now, bench.position if read is None else read)
-    measured = dataclasses.replace(plain.measured, **{"mode": ON, **fields})
-    bench.safety.update(dataclasses.replace(plain, measured=measured))
-    return bench.cycle(target=target, fresh=False, follow=follow)
+def cycle(bench, target=MIDDLE, **fields):
+    """One exchange with other fields of the measurement."""
+    return bench.cycle(target, **fields)
 
 
 def changed(base, index, value):
     array = np.array(base)
     array[index] = value
     return array
-
-
-@pytest.fixture
-def bench(hand):
-    bench = Bench(hand)
-    bench.engage()
-    for _ in range(round(2.0 / CYCLE)):
-        cycle(bench)
-    return bench
 
 
 @pytest.mark.parametrize(("pause", "seconds"), [(0.05, 0.29 - 0.05 + 0.29), (0.15, 0.29)])
@@ -189,19 +175,19 @@ def wave(bench):
     return (MIDDLE + 0.5 * FREE * np.sin(bench.now + JOINTS)).astype(np.float32)
 
 
-@pytest.mark.parametrize("moving", [JOINTS >= 0, JOINTS == 4])
-def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench, moving):
-    """The hand squeezes, or its currents are frozen, too; all joints move, or one."""
+@pytest.mark.parametrize(
+    "target",
+    [
+        wave,
+        lambda bench: np.where(JOINTS == 4, wave(bench), MIDDLE),
+        lambda bench: MIDDLE + np.float32(0.29) * (JOINTS == 4),
+    ],
+)
+def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench, target):
+    """The hand squeezes, or its currents are frozen, too; all joints move, or one, or one by little."""
     frozen, start = bench.position.copy(), bench.now
-    while not bench.safety.latched and bench.now < start + 5:
-        cycle(bench, np.where(moving, wave(bench), MIDDLE), read=frozen, current=np.full(12, 0.7, np.float32))
-    assert bench.safety.latched == "no joint angle changes while the commands move" and bench.now - start < 2.5
-
-
-def test_frozen_encoders_are_noticed_where_a_command_moves_by_less_than_a_third_of_a_radian(bench):
-    frozen, current = bench.position.copy(), np.full(12, 0.7, np.float32)
-    for _ in range(round(3.0 / CYCLE)):
-        cycle(bench, MIDDLE + np.float32(0.29) * (JOINTS == 4), read=frozen, current=current)
+    while not bench.safety.latched and bench.now < start + 2.5:
+        cycle(bench, target(bench), read=frozen, current=np.full(12, 0.7, np.float32))
     assert bench.safety.latched == "no joint angle changes while the commands move"
 
 
@@ -242,21 +228,6 @@ def test_a_hand_that_follows_late_or_squeezes_raises_no_alarm(bench):
 
 
 # --- refusals ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("data", "serious", "text"),
-    [
-        ((1501028).to_bytes(4, "little"), True, "over-temperature (1501028)"),
-        ((1501035).to_bytes(4, "little") + b"\x04\x00", True, "over-current (1501035)"),
-        (b"\x1c\x00", True, "over-temperature (1501028)"),
-        (b"\x06", False, "busy (1501006)"),
-        (b"\xee\xee\xee\xee", False, "unknown error (ee ee ee ee)"),
-    ],
-)
-def test_an_error_frame_keeps_its_number(data, serious, text):
-    refusal = read_refusal(data)
-    assert refusal.serious == serious and text in refusal.text
 
 
 @pytest.mark.parametrize(("between", "fatal"), [("", True), ("busy", False), ("answer", False)])

@@ -128,7 +128,7 @@ def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms(loop):
         assert not port.turn_off(off, 0.05)
 
 
-def test_a_command_without_an_answer_may_have_turned_the_motors_on(loop):
+def test_a_command_without_an_answer_may_have_turned_the_motors_on_and_may_not_have_turned_them_off(loop):
     run(loop, AGREEING)
     loop.engage()
     loop.port.silent_until = loop.port.now + 2 * CYCLE
@@ -137,9 +137,13 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on(loop):
     assert loop.driven and Mode.POSITION not in loop.port.modes
     run(loop, 5)
     assert loop.driven and loop.port.modes[-1] == Mode.POSITION
-    loop.safety.relax("enough")
+    loop.port.silent_until = loop.port.now + 3.0
+    run(loop, round(2.0 / CYCLE))
+    assert loop.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
+    assert loop.driven
+    loop.port.now = loop.port.silent_until
     run(loop, 1)
-    assert not loop.driven
+    assert not loop.driven, "it has answered"
     loop.stop()
     assert not loop.driven and loop.port.modes[-1] == Mode.PASSIVE
 
@@ -159,18 +163,6 @@ def test_the_velocity_knows_no_wrong_reading_and_begins_anew_with_a_connection(l
     for number in (20, 21):
         sample = loop._sample(Reply(far, loop.port.now, loop.port.now + CYCLE, number, 2))
         np.testing.assert_array_equal(sample.velocity, 0.0)
-
-
-def test_a_hand_that_was_silent_when_it_was_told_to_turn_off_may_still_be_on(loop):
-    run(loop, AGREEING)
-    loop.engage()
-    run(loop, 5)
-    loop.port.silent_until = loop.port.now + 3.0
-    run(loop, round(2.0 / CYCLE))
-    assert loop.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
-    assert loop.driven
-    loop.stop()
-    assert not loop.driven and loop.port.modes[-1] == Mode.PASSIVE
 
 
 def test_who_keeps_the_log_is_told_when_a_zero_has_moved(loop):

@@ -62,20 +62,15 @@ class Hands:
 # What a hand reads instead of its true angles. `past` has those of all cycles since the connection.
 
 
-def spike(rng):
-    at, joint, size = rng.integers(12), rng.integers(12), rng.choice([-1, 1]) * rng.uniform(0.02, 0.6)
-    return lambda k, past: past[-1] + size * (np.arange(12) == joint) * (k == at)
-
-
 def huge(rng):
     at, joint, value = rng.integers(12), rng.integers(12), rng.choice([np.nan, 1e30, -1e30])
     return lambda k, past: np.where((np.arange(12) == joint) & (k == at), value, past[-1])
 
 
-def several(rng):
-    """Two to four equal ones, in a row or with true ones between them."""
+def spikes(rng):
+    """One to four equal ones, in a row or with true ones between them."""
     joint, size = rng.integers(12), rng.choice([-1, 1]) * rng.uniform(0.02, 0.6)
-    wrong = set(rng.integers(0, 15) + rng.permutation(6)[: rng.integers(2, 5)])
+    wrong = set(rng.integers(0, 15) + rng.permutation(6)[: rng.integers(1, 5)])
     return lambda k, past: past[-1] + size * (np.arange(12) == joint) * (k in wrong)
 
 
@@ -114,7 +109,7 @@ def swapped(rng):
     return read
 
 
-KINDS = (spike, huge, several, drift, stuck, noise, swapped)
+KINDS = (spikes, huge, drift, stuck, noise, swapped)
 
 
 def starts(hand, kinds):
@@ -253,38 +248,20 @@ def test_a_wrong_angle_in_a_hold_is_not_eased_to(held, case, seconds, far):
     assert on[: round(1.0 / CYCLE)].all() and not on[-1]
 
 
-def test_a_finger_that_is_pushed_gives_way(hand):
-    """By a tenth of a radian from where it was, at the speed of starts."""
-    bench = ready(hand)
-    commands = []
-    for _ in range(round(1.0 / CYCLE)):
-        bench.position = bench.position - np.float32(0.004) * JOINT
-        commands.append(bench.cycle(target=MIDDLE, follow=False, force=30.0).position[4] - MIDDLE[4])
-    assert np.abs(np.diff(commands)).max() <= 0.5 * CYCLE + 1e-6
-    assert commands[-1] == pytest.approx(-0.1, abs=0.005)
-
-
-@pytest.mark.parametrize(("share", "ended"), [(15, False), (30, True)])
+@pytest.mark.parametrize(("share", "ended"), [(18, False), (35, True)])
 def test_short_holds_may_take_a_fifth_of_the_time(hand, share, ended):
     """A policy that touches too hard now and then goes on."""
     bench = ready(hand)
-    for k in range(round(42.0 / CYCLE)):
+    for k in range(round(30.0 / CYCLE)):
         bench.cycle(target=MIDDLE, force=30.0 * (k % 100 < share))
         if bench.safety.latched:
             break
     assert bool(bench.safety.latched) == ended
 
 
-@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"target": np.full(12, np.nan)}])
-def test_no_hold_lasts_for_ever(hand, event):
-    bench = ready(hand)
-    modes = [decision.mode != 0 for decision in bench.run(8.0, **{"target": MIDDLE} | event)]
-    assert 4.98 <= sum(modes) * CYCLE < 5.1 and not modes[-1] and bench.safety.latched.endswith("for 5 s")
-
-
 RARE = 1e-3  # probability in a cycle that the cable comes out, and that a run ends and another begins
 LENGTH = 30  # answers in which the angles of a fault are wrong, some or all
-ANGLES = (spike, huge, several, drift, noise, swapped)
+ANGLES = (spikes, huge, drift, noise, swapped)
 # Faults of what is no angle: what a joint or 60 taxels of a fingertip read, and in how many answers.
 OTHERS = dict(temperature=(255, 1), current=(-3000, 5), joint_error=(4, 3), raw_position=(0, 3), taxel=(9, 10))
 
@@ -305,25 +282,20 @@ class Faulty(HandPort):
         return self.hands.time
 
     def exchange(self, command):
-        if self._away:
-            return self._lost()
-        if self.rng.random() < RARE:
-            self._away = int(self.rng.integers(2, 150))
-        on = bool(command["mode"][0] == Mode.POSITION)
-        self._command = command["position"][None].astype(float), np.array([on]), command["kp"][:1] / KP
-        self._move()
-        return self._answer()
-
-    def _lost(self):
-        """The cable is out: the hand keeps to its last command. When it is back, its motors go off, and it sinks."""
-        self._away -= 1
-        if self._away:
+        """While the cable is out, the hand keeps to its last command. When it is back, its motors go off."""
+        if self._away == 1:
+            self.reconnections += 1
+            self._generation += 1
+            self.sink()
+        elif not self._away:
+            on = np.array([command["mode"][0] == Mode.POSITION])
+            self._command = command["position"][None].astype(float), on, command["kp"][:1] / KP
             self._move()
-            return None
-        self.reconnections += 1
-        self._generation += 1
-        self.sink()
-        return self._answer()
+            self._away = int(self.rng.integers(3, 151)) * (self.rng.random() < RARE)
+        else:
+            self._move()
+        self._away = max(self._away - 1, 0)
+        return None if self._away else self._answer()
 
     def sink(self):
         """The motors are off for a while."""

@@ -24,13 +24,6 @@ from dexsim_real.core.process import ignore_signals, stopping
 pytest.importorskip("serial")
 
 
-def runner(peer, folder, *without):
-    """As a shell starts what runs in the background: with Ctrl-C ignored."""
-    options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in without]
-    shell = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "dexsim_real.run"]
-    return subprocess.Popen([*shell, *options], cwd=ROOT, stderr=subprocess.PIPE)
-
-
 def wait(condition, seconds=60.0):
     until = time.monotonic() + seconds
     while not condition():
@@ -40,9 +33,11 @@ def wait(condition, seconds=60.0):
 
 @contextlib.contextmanager
 def moving(folder, *without):
-    """A runner whose motors are on, and its hand."""
+    """A runner whose motors are on, and its hand. As shells start what runs in the background: with Ctrl-C ignored."""
+    shell = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "dexsim_real.run"]
     with FollowingHand() as peer:
-        process = runner(peer, folder, *without)
+        options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in without]
+        process = subprocess.Popen([*shell, *options], cwd=ROOT, stderr=subprocess.PIPE)
         try:
             wait(lambda: peer.on().sum() > 60 or process.poll() is not None)
             assert process.poll() is None, process.stderr.read()
@@ -140,12 +135,6 @@ def test_the_guard_waits_for_a_cable():
         assert guard._process.wait(10) == 0
 
 
-@pytest.fixture
-def peer():
-    with FollowingHand() as peer:
-        yield peer
-
-
 @pytest.mark.parametrize("wakes", [True, False])
 def test_a_machine_that_paused_gets_a_second_look(monkeypatch, wakes):
     """When all of it stood still, the runner's sign is overdue as the guard wakes, and comes a moment later."""
@@ -165,11 +154,11 @@ def test_a_machine_that_paused_gets_a_second_look(monkeypatch, wakes):
     assert looks[2] == guard._MOMENT
 
 
-def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
+def test_a_suspended_guard_is_noticed_within_a_second(tmp_path, monkeypatch):
     patience = guard._ANSWER
     assert patience + guard._MOMENT < 1.0
     monkeypatch.setattr(guard, "_ANSWER", 20.0)  # A busy machine is not a suspended guard.
-    watched = Guard(peer.port, QUICK, load_hand())
+    watched = Guard(str(tmp_path / "port"), QUICK, load_hand())
     try:
         assert select.select([watched._output], [], [], 20)[0]
         watched.check()  # A node asks before its motors come on.
@@ -194,39 +183,40 @@ def test_a_suspended_guard_is_noticed_within_a_second(peer, monkeypatch):
         watched._process.kill()
 
 
-def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(peer, tmp_path, monkeypatch):
+LOUD = """
+import sys
+from scripted_driver import ScriptedDriver
+
+print("SDK 1.0", flush=True)
+opened = []
+
+class Loud(ScriptedDriver):
+    def connect(self):
+        print("connecting", flush=True)
+        if len(opened) < 2:
+            sys.exit("not found")
+
+    def send(self, targets):
+        super().send(targets)
+        with open({path!r}, "a") as file:
+            print(targets.on, file=file)
+
+    def close(self):
+        raise RuntimeError("close failed")
+
+def open_hand(hand, config):
+    opened.append(config)
+    return Loud(hand)
+"""
+
+
+def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(tmp_path, monkeypatch):
     """What it prints is no word of the guard's, and has no reader once the runner is gone."""
-    (tmp_path / "loud_sdk.py").write_text(
-        "import sys\n"
-        "from dexsim_real.wire.driver import DriverState\n"
-        "from dexsim_real.wire.frames import Mode, passive_command\n"
-        "from dexsim_real.wire.link import SerialHand\n"
-        "print('SDK 1.0', flush=True)\n"
-        "opened = []\n"
-        "class Loud:\n"
-        "    measures = frozenset()\n"
-        "    def __init__(self, *given):\n"
-        "        self.hand = SerialHand(*given)\n"
-        "    def send(self, targets):\n"
-        "        assert not targets.on\n"
-        "    def read(self):\n"
-        "        reply = self.hand.exchange(passive_command())\n"
-        "        return reply and DriverState(reply.state['joint']['position'], reply.state['joint']['id'] < 0)\n"
-        "    def connect(self):\n"
-        "        print('connecting', flush=True)\n"
-        "        if len(opened) < 2:\n"
-        "            sys.exit('not found')\n"
-        "        return self.hand.connect()\n"
-        "    def close(self):\n"
-        "        self.hand.close()\n"
-        "        raise RuntimeError('close failed')\n"
-        "def open_hand(hand, config):\n"
-        "    opened.append(config)\n"
-        f"    return Loud({peer.port!r}, config)\n"
-    )
+    heard = tmp_path / "heard"
+    (tmp_path / "loud_sdk.py").write_text(LOUD.format(path=str(heard)))
     monkeypatch.syspath_prepend(tmp_path)
     armed = Guard("sdk:loud_sdk", QUICK, load_hand())
     armed.arm()
     armed.dismiss(off=False)
     assert armed._process.wait(10) == 0
-    assert peer.commands and not peer.on().any()
+    assert set(heard.read_text().split()) == {"False"}

@@ -12,10 +12,9 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.plant.shapes import SHAPES, product
-from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera, virtual_imu
+from dexsim_real.twin.plant.shapes import SHAPES
+from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera
 from dexsim_real.twin.wire import picture
 
 OPTICS = CameraConfig()
@@ -27,33 +26,25 @@ class Scripted:
 
     period = 0.03
 
-    def __init__(self, hand, task, script, sources=()):
-        self.hand, self.spec = hand, load_policy(task).spec
-        self.sources, self._script, self.seen = set(sources), script, []
+    def __init__(self, hand, task, script):
+        self.hand, self.spec, self.sources = hand, load_policy(task).spec, {"imu"}
+        self._script, self.ticks = script, 0
 
     def start(self, target):
         self.target = np.array(target)
 
-    def anchor(self, target):
-        self.target = np.array(target)
-
     def tick(self, measured, seen, goal, command):
-        self.seen.append((measured, seen, goal, command))
-        target = self._script(len(self.seen), self.target).astype(np.float32)
-        return Tick(None, None, None, target)
-
-
-def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, **overrides):
-    plant = EmulatedHand(hand, task, 4, kind="nominal", trials=1, seconds=seconds, overrides=CALM | overrides)
-    controller = Scripted(hand, task, script, sources)
-    return VirtualRun(plant, controller, 0.25), plant, controller
+        self.ticks += 1
+        return Tick(None, None, None, self._script(self.ticks, self.target).astype(np.float32))
 
 
 def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypatch):
     """With one target that is too far away; an exchange begins every 12 ms, and its answer is there 9.6 ms later."""
     monkeypatch.setattr("dexsim_real.twin.virtual._APPROACH", 1.0)
     far = 0.8 * (np.arange(12) == 4)
-    run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
+    plant = EmulatedHand(hand, "rotate", 4, kind="nominal", trials=1, seconds=0.5, overrides=CALM)
+    controller = Scripted(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4) + far * (k == 9))
+    run = VirtualRun(plant, controller, 0.25)
     update, heard = run.safety.update, []
     run.safety.update = lambda sample: heard.append(sample.time) or update(sample)
     list(run.ticking())
@@ -61,32 +52,10 @@ def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypa
     assert report["end"] == "time limit" and report["seconds"] == pytest.approx(0.5) and report["command"] == 0.25
     assert report["bridge"]["successes"] == run.policy.goals.successes == 0
     assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
-    assert abs(len(controller.seen) * controller.period - 0.5) < 0.15
+    assert abs(controller.ticks * controller.period - 0.5) < 0.15
     assert run.port.counts.answered == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
     assert heard[0] == pytest.approx(0.0096) and np.ptp(np.diff(heard)[40:] - 1 / RATE) < 1e-9
-    measured = controller.seen[-1][0]
-    # What the policy sees has the wire's steps: 12 bits a turn, 0.1 N, 1 mA.
-    for values, step in (
-        (measured.joint_position, 2 * math.pi / 4096),
-        (measured.taxel_force, 0.1),
-        (measured.current, 0.001),
-    ):
-        assert values / step == pytest.approx(np.round(values / step), abs=1e-2)
     assert json.loads(json.dumps(report)) == report
-
-
-def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
-    for tilt in (0.0, 0.12):
-        plant = EmulatedHand(
-            hand, "rotate", 1, kind="nominal", overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt}
-        )
-        port = VirtualPort(plant)
-        imu = virtual_imu(port, 1)
-        port.sleep(0.0901)
-        imu.calibrate(IDENTITY)
-        true = plant.measure_object()[1]
-        apart = 2 * math.acos(min(1.0, abs(float(product(imu.read()[1] * [1, -1, -1, -1], true)[0]))))
-        assert apart < 0.002
 
 
 def test_the_camera_measures_the_height(hand):

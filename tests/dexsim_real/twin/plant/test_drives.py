@@ -38,7 +38,7 @@ def test_current_at_a_static_torque_and_its_limits(hand):
     made.send(0.0, motors(0.1))
     torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
     assert torque == pytest.approx(np.full(12, 0.3))
-    assert made.current == pytest.approx(0.3 / hand.torque_limit * STALL_CURRENT)
+    assert made.current == pytest.approx(0.3 / hand.torque_limit * STALL_CURRENT) and not made.at_limit().any()
     # Stalled: the whole torque at 300, half of it at 150; none at the no-load speed, all of it when braking.
     for torque_max, speed, share in (
         (300, 0.0, 1.0),
@@ -52,6 +52,12 @@ def test_current_at_a_static_torque_and_its_limits(hand):
         made.send(0.0, motors(1.5 + 2 * (speed > 0), torque_max=torque_max))
         torque, _ = made.step(0.0, np.zeros(12), speed * hand.speed_limit)
         assert torque == pytest.approx(share * hand.torque_limit, abs=1e-6), (torque_max, speed)
+        assert made.at_limit().all()
+    made.send(0.0, motors(-np.where(np.arange(12) % 2, 1.0, 0.01)))  # 3 Nm and 0.03 Nm; they stall at 1.1 and 0.4 Nm
+    made.step(0.0, np.zeros(12), np.zeros(12))
+    np.testing.assert_array_equal(made.at_limit(), np.arange(12) % 2 == 1)
+    made.send(0.0, motors(1.0, mode=Mode.PASSIVE))
+    assert not made.step(0.0, np.zeros(12), np.zeros(12))[0].any() and not made.at_limit().any()
 
 
 def test_losses_depend_on_the_direction_of_power(hand):
@@ -91,20 +97,3 @@ def test_heat_settles_where_loss_and_flow_balance(hand, monkeypatch):
     torque, _ = made.step(9.0, np.zeros(12), np.zeros(12))
     weaker = 1 - constants.WEAKENING * (made.winding - constants.REFERENCE)
     assert torque == pytest.approx(0.3 * hand.torque_limit * weaker, rel=1e-3)
-
-
-def test_a_drive_is_at_its_limit_where_it_asks_for_more(hand):
-    made = drives(hand)
-    torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
-    assert not torque.any() and not made.current.any() and not made.at_limit().any()
-    step = np.where(np.arange(12) % 2, 1.0, 0.01)  # 3 Nm and 0.03 Nm; they stall at 1.1 and 0.4 Nm
-    for sign in (1, -1):
-        made.send(0.0, motors(sign * step))
-        made.step(0.0, np.zeros(12), np.zeros(12))
-        np.testing.assert_array_equal(made.at_limit(), np.arange(12) % 2 == 1)
-    made.send(0.0, motors(0.1, torque_max=15))  # 0.3 Nm asked for, 0.055 and 0.02 Nm allowed
-    made.step(0.0, np.zeros(12), np.zeros(12))
-    assert made.at_limit().all()
-    made.send(0.0, motors(1.0, mode=Mode.PASSIVE))
-    made.step(0.0, np.zeros(12), np.zeros(12))
-    assert not made.at_limit().any()

@@ -14,6 +14,7 @@ from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.start import CLEARANCE
+from dexsim_ppo.policy import load_policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import emulated_hand, parameters, referee
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear
@@ -28,8 +29,6 @@ def bands(task):
 
 @pytest.mark.parametrize("task", SKILLS)
 def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_policies(hand, task):
-    from dexsim_ppo.policy import load_policy
-
     shipped = load_policy(task).env_config
     for config in (to_dict(TRAINED[task].config()), shipped):
         for name, band in bands(task).items():
