@@ -29,7 +29,7 @@ from dexsim_ppo import evaluate, load_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES, RESULTS = ROOT / "docs" / "images", ROOT / "docs" / "results"
-sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests" / "support")]  # `paper`; `calibrating`
+sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests" / "support")]  # `paper`; the bench of the presses
 FILMS = {"grasp": 8, "rotate": 20, "rotate_without_orientation": 20, "rotate_clear": 10}  # s of each episode
 
 
