@@ -21,12 +21,6 @@ def run(*command: object, cwd: Path = ROOT) -> str:
     return done.stdout
 
 
-def test_links_lead_somewhere():
-    for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")):
-        links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
-        assert not [link for link in links if "://" not in link and not (page.parent / link).exists()], page
-
-
 @pytest.mark.slow
 def test_the_wheel_is_whole_and_works_from_another_directory(tmp_path):
     """Built and installed without fetching anything."""
