@@ -14,8 +14,9 @@ import pytest
 from tiny_env import SMALL
 
 from dexsim.core.layout import LayoutEntry
-from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner.adapter import AdaptedState
 from dexsim_ppo.learner.loss import loss
 from dexsim_ppo.learner.networks import init_params
 from dexsim_ppo.learner.running_stats import RunningStats
@@ -39,19 +40,6 @@ CONFIG = dataclasses.replace(
 )
 
 
-@pytree_dataclass
-class Played:
-    """Where an episode of the script is."""
-
-    row: jax.Array
-    time: jax.Array  # since the episode began
-    obs: dict[str, jax.Array]
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    metrics: dict[str, jax.Array]
-
-
 class Script:
     """Each row plays the same episode again and again, whatever the actions."""
 
@@ -70,14 +58,14 @@ class Script:
     def at(self, row, time, reward=0.0, terminated=False, truncated=False):
         obs = {group: jnp.asarray(values, jnp.float32)[time, row] for group, values in self.obs.items()}
         flags = jnp.asarray(terminated, bool), jnp.asarray(truncated, bool)
-        return Played(row, jnp.asarray(time, jnp.int32), obs, jnp.asarray(reward, jnp.float32), *flags, {})
+        return AdaptedState(row, obs, jnp.asarray(reward, jnp.float32), *flags, {}, jnp.asarray(time, jnp.int32), None)
 
     def restart(self, state, done):
-        return choose(done, self.at(state.row, 0), state)
+        return choose(done, self.at(state.inner, 0), state)
 
     def step(self, state, action):
-        now = [jnp.asarray(x)[state.time, state.row] for x in (self.reward, self.terminated, self.truncated)]
-        return self.at(state.row, state.time + 1, *now)
+        now = [jnp.asarray(x)[state.clock, state.inner] for x in (self.reward, self.terminated, self.truncated)]
+        return self.at(state.inner, state.clock + 1, *now)
 
 
 def setting(seed, **options):
