@@ -113,34 +113,66 @@ def test_log_std_stays_between_floor_and_cap(learner):
         np.testing.assert_allclose(jnp.exp(moved.params.log_std), bound, rtol=1e-5)
 
 
-# Actions beyond what the environment takes; one update.
-WIDE = dataclasses.replace(SMALL, initial_std=1.0, epochs=1, minibatches=1)
+# --- seven iterations of one update each, with ranges that widen with success ------------------------------
+
+RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
 
 class Watched(TinyEnv):
-    """Shows the critic other numbers than the actor."""
+    """Shows the critic other numbers than the actor; all episodes begin and end together."""
 
     def _observe(self, state):
         state = super()._observe(state)
         return dataclasses.replace(state, obs={"actor": state.obs["actor"], "critic": 3.0 * state.obs["actor"] + 5.0})
 
+    def randomize_episode_time(self, state, key):
+        return state
 
-def test_every_group_has_the_statistics_of_its_own_observations():
-    training = training_of(WIDE, Watched)
-    after, _ = training.step(training.init(jax.random.key(0)))
-    actor, critic = (after.observation_stats[group] for group in ("actor", "critic"))
-    np.testing.assert_allclose(critic.mean[1:], 3 * actor.mean[1:] + 5, rtol=1e-4)
-    np.testing.assert_allclose(critic.variance[1:], 9 * actor.variance[1:], rtol=1e-3)
+
+@pytest.fixture(scope="module")
+def watched():
+    """The last state, and each iteration's metrics."""
+    training = make_train(
+        Watched(TinyConfig(horizon=4)), dataclasses.replace(SMALL, initial_std=1.0, epochs=1, minibatches=1), RULES
+    )
+    state, rows = training.init(jax.random.key(0)), []
+    for _ in range(7):
+        state, metrics = training.step(state)
+        rows.append({name: float(value[0]) for name, value in metrics.items()})
+    assert training.step._cache_size() == 1
+    return state, rows
+
+
+def test_every_group_has_the_statistics_of_its_own_observations(watched):
+    actor, critic = (watched[0].observation_stats[group] for group in ("actor", "critic"))
+    np.testing.assert_allclose(critic.mean, 3 * actor.mean + 5, rtol=1e-4)
+    np.testing.assert_allclose(critic.variance, 9 * actor.variance, rtol=1e-3)
     assert np.all(np.asarray(actor.variance) > 1e-3)
 
 
-def test_the_first_minibatch_meets_the_policy_that_collected_it():
+def test_the_first_minibatch_meets_the_policy_that_collected_it(watched):
     """With the normalisers of the collection: the divergence is zero, and no ratio is clipped."""
-    training = training_of(WIDE, Watched)
-    state = training.init(jax.random.key(0))
-    for _ in range(3):
-        state, metrics = training.step(state)
-        assert abs(float(metrics["kl"][0])) < 1e-6 and float(metrics["clip_fraction"][0]) == 0.0
+    for row in watched[1]:
+        assert abs(row["kl"]) < 1e-6 and row["clip_fraction"] == 0.0
+
+
+def test_ranges_widen_with_success_and_episodes_update_scale(watched):
+    state, rows = watched
+    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
+    assert all(row["curriculum/success"] == 1 for row in rows)
+    np.testing.assert_allclose(state.scale, 1.0)
+    np.testing.assert_array_equal(state.env_state.scale, np.ones(SMALL.num_envs, np.float32))
+    # Two episodes of four steps in an iteration of eight: both are drawn at the scale that it began with.
+    np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
+
+
+def test_no_ended_episode_says_nothing_and_an_unknown_metric_is_named():
+    """`training/test_presets.py` has a metric by name."""
+    metrics = {"terminated_share": jnp.float32(jnp.nan), "episode/goals": jnp.float32(7.0)}
+    scale, success = update_scale(RULES, jnp.float32(0.5), metrics)
+    assert np.isnan(success) and float(scale) == 0.5
+    with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
+        update_scale(dataclasses.replace(RULES, metric="step/luck"), scale, metrics)
 
 
 def test_training_begins_amid_episodes():
@@ -202,44 +234,3 @@ def test_learning_rate_adapts_within_its_band():
             assert float(after) == pytest.approx(1e-3 * factor), (iteration, share)
     fixed = dataclasses.replace(config, kl_target=0.0)
     assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
-
-
-# --- the curriculum: ranges that widen with success, carried in the training state ------------------------
-
-RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
-
-
-class Together(TinyEnv):
-    """All episodes begin and end together."""
-
-    def randomize_episode_time(self, state, key):
-        return state
-
-
-def run(env, rules, iterations):
-    training = make_train(env, SMALL, rules)
-    state, rows = training.init(jax.random.key(0)), []
-    for _ in range(iterations):
-        state, metrics = training.step(state)
-        rows.append({name: float(value[0]) for name, value in metrics.items()})
-    assert training.step._cache_size() == 1
-    return state, rows
-
-
-def test_ranges_widen_with_success_and_episodes_update_scale():
-    state, rows = run(Together(TinyConfig(horizon=4)), RULES, 7)
-    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
-    assert all(row["curriculum/success"] == 1 for row in rows)
-    np.testing.assert_allclose(state.scale, 1.0)
-    np.testing.assert_array_equal(state.env_state.scale, np.ones(SMALL.num_envs, np.float32))
-    # Two episodes of four steps in an iteration of eight: both are drawn at the scale that it began with.
-    np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
-
-
-def test_no_ended_episode_says_nothing_and_an_unknown_metric_is_named():
-    """`training/test_presets.py` has a metric by name."""
-    metrics = {"terminated_share": jnp.float32(jnp.nan), "episode/goals": jnp.float32(7.0)}
-    scale, success = update_scale(RULES, jnp.float32(0.5), metrics)
-    assert np.isnan(success) and float(scale) == 0.5
-    with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
-        update_scale(dataclasses.replace(RULES, metric="step/luck"), scale, metrics)
