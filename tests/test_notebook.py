@@ -14,7 +14,6 @@ nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
 
-NUMBER = r"(-?\d+\.?\d*)"
 # Number of pictures, and what is printed.
 EXPECTED = {
     "quickstart": (
@@ -56,16 +55,6 @@ def check(name, notebook):
     for pattern in patterns:
         assert re.search(pattern, text), (pattern, text)
     assert len(pictures) == count and all(picture.std() > 10 for picture in pictures)
-    if name == "touch":
-        pairs = re.findall(rf"^[xyz]: +{NUMBER} N/m by gradient, +{NUMBER} N/m", text, re.MULTILINE)
-        assert len(pairs) == 3
-        slopes = np.array(pairs, float)
-        np.testing.assert_allclose(*slopes.T, atol=0.02 * np.abs(slopes).max())
-    if name == "motors":
-        found = re.findall(rf"^(stiffness|damping) +{NUMBER}, truth +{NUMBER},", text, re.MULTILINE)
-        assert len(found) == 2
-        for _, value, truth in found:
-            assert float(value) == pytest.approx(float(truth), rel=0.1)
 
 
 def test_all_that_they_import_is_there():
