@@ -1,17 +1,14 @@
 """How many episodes are measured and which, and what is made of the totals of long ones."""
 
 import dataclasses
+from collections import namedtuple
 from types import SimpleNamespace
-from typing import Any
 
-import jax
 import numpy as np
 import pytest
-from tiny_env import SMALL, TinyEnv, training_of
+from tiny_env import TinyEnv
 
-from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.evaluate import Evaluator, mean_interval, summarize
-from dexsim_ppo.policy import Policy
 
 
 class Totals(TinyEnv):
@@ -21,11 +18,6 @@ class Totals(TinyEnv):
 
     def summarize(self, metrics, alive):
         return {"lived": alive.tolist()}
-
-
-@pytest.fixture(scope="module")
-def policy():
-    return Policy.from_training(TinyEnv(), SMALL, training_of().init(jax.random.key(0)))
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +44,7 @@ def test_totals_are_those_of_the_series(policy, evaluator):
     assert totals["task"] == {"lived": [32] * 8}
 
 
-@pytree_dataclass
-class Commanded:
-    """What a film of `Commands` holds."""
-
-    command: Any
+Commanded = namedtuple("Commanded", "command")
 
 
 class Commands(TinyEnv):
