@@ -78,7 +78,7 @@ class TinyEnv(Adapted):
     def __init__(self, config: TinyConfig | None = None, *, backend: str = "mjx"):
         self.config, self.backend = config or TinyConfig(), "mjx" if backend == "auto" else backend
 
-    def _start(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
+    def reset(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
         key, subkey = jax.random.split(key)
         scale, zero, false = jnp.float32(scale), jnp.float32(0), jnp.bool_(False)
         x, target = scale * jax.random.uniform(subkey, (2,), minval=-1.0, maxval=1.0)
@@ -88,9 +88,6 @@ class TinyEnv(Adapted):
     def _observe(self, state: TinyState) -> TinyState:
         obs = jnp.stack([state.x, state.target, jnp.maximum(state.x, 0.0)])
         return dataclasses.replace(state, obs={"actor": obs, "critic": obs})
-
-    def reset(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
-        return self._start(key, scale)
 
     def set_randomization_scale(self, state: TinyState, scale: jax.Array) -> TinyState:
         return dataclasses.replace(state, scale=scale)
@@ -122,10 +119,7 @@ class TinyEnv(Adapted):
         )
 
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
-        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key, state.scale), state)
-
-    def snapshot(self, state: TinyState) -> dict[str, jax.Array]:
-        return {"x": state.x}
+        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self.reset(state.key, state.scale), state)
 
 
 def leaves(tree: Any) -> dict[str, np.ndarray]:

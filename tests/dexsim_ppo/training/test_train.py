@@ -141,7 +141,6 @@ TRAIN_ERRORS = {
     "folder of a run": (["--run-dir", "RUN"], "exists already"),
     "another task": (["--task", "grasp", "--resume", "RUN"], "of the task 'tiny', not 'grasp'"),
     "another seed": (["--resume", "RUN", "--seed", "9"], "--seed 9: a resumed run keeps its 0"),
-    "another learner": (["--resume", "RUN", "--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed"),
 }
 EVALUATE_ERRORS = {
     "cut short": (["broken.msgpack"], "cut short"),
