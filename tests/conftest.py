@@ -76,8 +76,8 @@ hypothesis.settings.load_profile("dexsim")
 LONGEST = """
 test_hand_tasks test_shipped_policy test_identification test_docs test_engines test_check_hand test_press_fit
 test_procedure test_import_hand test_identify_drives test_env test_shipped_policies test_gymnasium test_learning
-test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_train
-test_true_angles test_c_backend test_randomization
+test_fine_tune test_motors_off test_notebook test_bridge_run test_mock test_rotate test_controller test_train
+test_sharding test_iteration test_true_angles test_c_backend test_randomization
 """.split()
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8

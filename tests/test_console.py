@@ -23,18 +23,6 @@ def test_a_word_runs_the_module_with_the_rest_of_the_line(monkeypatch):
         assert console.main([name, "--seed", "1"]) == 7 and given == [["--seed", "1"]]
 
 
-def test_every_command_of_the_modules_has_a_word():
-    modules = {module for module, _ in console.COMMANDS.values()}
-    folders = [ROOT / package for package in ("dexsim", "dexsim_ppo", "dexsim_real")]
-    found = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        for folder in folders
-        for path in folder.rglob("*.py")
-        if "cli.run(main)" in path.read_text()
-    }
-    assert found - {"dexsim.__main__"} == modules
-
-
 def test_help_lists_the_commands_and_a_typo_is_named(capsys):
     assert console.main([]) == 0
     shown = capsys.readouterr().out

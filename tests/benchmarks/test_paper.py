@@ -1,6 +1,5 @@
 """The paper's tables and figures: all of them with a tiny budget, what is resumed, and what the rows consist of."""
 
-import dataclasses
 import importlib
 import json
 from types import SimpleNamespace
@@ -24,31 +23,12 @@ def paper():
         yield SimpleNamespace(**{name: importlib.import_module(f"paper.{name}") for name in names})
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """A folder of one's own, in which trainings are kept as well."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def stub(paper, **changes):
-    """An experiment of three rows that counts what it measures."""
-    calls = []
-
-    def measure(row, seed, budget, work):
-        calls.append((row.name, seed))
-        return {"value": len(calls)}
-
-    rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
-    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "training_seeds": 3}
-    return paper.data.Experiment(rows=rows, measure=measure, **given | changes), calls
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["readings", "all"])
-def test_smoke(paper, here, capsys, name):
+def test_smoke(paper, tmp_path, monkeypatch, capsys, name):
     """Every row has a report, every experiment its table or figures; another run has nothing to do."""
-    output = here / "reports"
+    monkeypatch.chdir(tmp_path)  # where trainings are kept as well
+    output = tmp_path / "reports"
     assert paper.command.main([name, "--budget", "smoke", "--output", str(output)]) == 0
     for experiment in [known for known in paper.experiments.EXPERIMENTS.values() if name in ("all", known.name)]:
         for row in experiment.rows:
@@ -64,22 +44,25 @@ def test_smoke(paper, here, capsys, name):
     assert "0 of 1 seeds" not in capsys.readouterr().out
 
 
-def test_rows_and_seeds_go_on_where_they_stopped(paper, here):
-    experiment, calls = stub(paper)
-    measure = experiment.measure
+def test_rows_and_seeds_go_on_where_they_stopped(paper, tmp_path):
+    calls, stops = [], [("b", 1)]
 
-    def fails(row, seed, budget, work):
-        if (row.name, seed) == ("b", 1):
+    def measure(row, seed, budget, work):
+        if (row.name, seed) in stops:
             raise KeyboardInterrupt
-        return measure(row, seed, budget, work)
+        calls.append((row.name, seed))
+        return {"value": len(calls)}
 
-    budget = paper.data.BUDGETS["cpu"]
+    rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
+    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "training_seeds": 3}
+    experiment, budget = paper.data.Experiment(rows=rows, measure=measure, **given), paper.data.BUDGETS["cpu"]
     with pytest.raises(KeyboardInterrupt):
-        paper.command.run(dataclasses.replace(experiment, measure=fails), budget, here, here / "work")
+        paper.command.run(experiment, budget, tmp_path, tmp_path / "work")
     assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 0)]
-    paper.command.run(experiment, budget, here, here / "work")
+    stops.clear()
+    paper.command.run(experiment, budget, tmp_path, tmp_path / "work")
     assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
-    report = json.loads((here / "stub" / "b" / "report.json").read_text())
+    report = json.loads((tmp_path / "stub" / "b" / "report.json").read_text())
     assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
 
 

@@ -1,4 +1,4 @@
-"""A policy as an ONNX model, in a bundle, and its own file without JAX: all act as the policy does."""
+"""A policy as an ONNX model, in a bundle, its own file without JAX: all act as the policy does. Recorded episodes."""
 
 import ast
 import hashlib
@@ -8,15 +8,20 @@ import shutil
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from paths import ROOT
 
+import dexsim
 from dexsim.calibration.maps import load_calibration
 from dexsim.control import move_target
-from dexsim.errors import CalibrationError, ConfigError, DexsimError
+from dexsim.core.compilation import jit
+from dexsim.env.evaluation import evaluation_of
+from dexsim.errors import CalibrationError, DexsimError
 from dexsim.hand.load import load_hand
 from dexsim.observation import FIELDS
+from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import export, load_policy, record
 from dexsim_ppo.portable import PortablePolicy
 
@@ -101,25 +106,36 @@ np.savez("found.npz", action=actions, target=targets)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ([], ConfigError, "give --output FILE or --bundle FOLDER_OR_ZIP"),
-        (["--bundle", "taken"], DexsimError, "taken: exists already"),
-    ],
+    ("command", "option"), [(export, "--output"), (export, "--bundle"), (record, "--npz"), (record, "--rrd")]
 )
-def test_a_bundle_that_cannot_be_written_is_one_line(arguments, error, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(error, match=message):
-        export.main(["grasp", *arguments])
-
-
-@pytest.mark.parametrize(("command", "option"), [(export, "--output"), (record, "--npz"), (record, "--rrd")])
 def test_no_output_takes_the_place_of_the_policy(command, option, tmp_path):
     path = str(shutil.copy(SHIPPED / "grasp.msgpack", tmp_path))
-    with pytest.raises(ConfigError, match=f"{option} .*: is the policy; name another file"):
+    before = (tmp_path / "grasp.msgpack").read_bytes()
+    with pytest.raises(DexsimError, match=f"{path}: (is the policy|exists already); name another "):
         command.main([path, option, path])
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
 
 
 def test_every_field_that_an_actor_may_observe_has_a_unit():
     assert set(export._UNITS) == {field.name for field in FIELDS.values() if field.source != "simulator"}
+
+
+@pytest.mark.slow
+def test_readings_and_targets_are_those_of_the_episodes():
+    env, policy = dexsim.make("grasp", GraspConfig(pool_size=80), backend="c"), load_policy("grasp")
+    found, shown = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
+    assert [len(one.time) for one in found] == [10, 10, 10]
+    for one, snapshots in zip(found, shown, strict=True):
+        np.testing.assert_allclose(snapshots.taxel_force, one.taxel_force)
+        assert snapshots.primitive_active.shape == (10, len(env.primitive_kinds))
+    protocol, memory = evaluation_of(env), policy.initial_carry(3)
+    state = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(3, 0))
+    step = jit(jax.vmap(env.step), once=True)
+    for tick in range(10):
+        for i, one in enumerate(found):
+            for name in ("joint_position", "taxel_force", "command"):
+                wanted = np.asarray(getattr(state.readings, name))[i]
+                np.testing.assert_allclose(getattr(one, name)[tick], wanted, atol=2e-3)
+        memory, action = policy.act(memory, state.obs["actor"])
+        state = step(state, action)
+        np.testing.assert_allclose([one.target[tick] for one in found], state.joint_target, atol=2e-3)

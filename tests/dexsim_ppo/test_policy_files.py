@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
+from tiny_env import TinyConfig, leaves
 
 from dexsim.core.config import from_dict
 from dexsim.core.errors import CheckpointError, DexsimError
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.policy import load_policy
 
 TREE = {
     "x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
@@ -30,25 +30,12 @@ def file(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def policy():
-    env = TinyEnv()
-    return Policy.from_training(env, SMALL, training_of().init(jax.random.key(0)), {"seed": 0})
-
-
-def equal(a, b):
-    def leaf(x, y):
-        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            x, y = jax.random.key_data(x), jax.random.key_data(y)
-        assert x.dtype == y.dtype and np.asarray(x).tobytes() == np.asarray(y).tobytes()
-
-    jax.tree.map(leaf, a, b)
-
-
 def test_checkpoint_round_trip(file):
     loaded = checkpoint.load(file, kind="train", task="tiny")
     assert loaded.content == {"answer": [1, 2.5, None]} and loaded.task == "tiny"
-    equal(checkpoint.restore(loaded, jax.eval_shape(lambda: TREE)), TREE)
+    restored = checkpoint.restore(loaded, jax.eval_shape(lambda: TREE))
+    assert jax.tree.map(lambda x: x.dtype, restored) == jax.tree.map(lambda x: x.dtype, TREE)
+    jax.tree.map(np.testing.assert_array_equal, leaves(restored), leaves(TREE))
     assert [p.name for p in file.parent.iterdir()] == ["a.msgpack"], "no temporary file is left"
 
 
@@ -81,7 +68,6 @@ def test_load_names_what_is_wrong(file, tmp_path):
         (newer, {"kind": "train"}, "format version 9"),
         (tmp_path / "text", {"kind": "train"}, "not a dexsim checkpoint"),
         (tmp_path / "missing", {"kind": "train"}, "cannot be read"),
-        (tmp_path, {"kind": "train"}, "cannot be read"),
     ):
         with pytest.raises(CheckpointError, match=word):
             checkpoint.load(path, **options)

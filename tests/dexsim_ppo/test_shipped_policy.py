@@ -11,7 +11,6 @@ import pytest
 from episodes import POOL_SIZE, by_field, reset_to
 
 import dexsim
-import dexsim_ppo
 from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
@@ -42,25 +41,6 @@ def test_it_fits_the_task_and_the_hand(hand, name):
     action = np.asarray(policy.act(policy.initial_carry(), jnp.zeros(size))[1])
     assert action.shape == (hand.num_joints,) and np.all(np.abs(action) <= 1.0)
     assert policy.control_rate == pytest.approx(1 / config.physics.control_period)
-
-
-@pytest.mark.parametrize("name", ["grasp", "rotate"])  # with and without memory
-def test_one_call_acts_under_jit_vmap_and_scan(name):
-    """Also over a whole episode at once, as `Policy.act` does tick by tick."""
-    policy = load_policy(name)
-    obs = np.random.default_rng(0).normal(size=(20, 3, SHIPPED[name][1])).astype(np.float32)
-    carry, expected = policy.initial_carry(3), []
-    for x in obs:
-        carry, action = policy.act(carry, x)
-        expected.append(action)
-    each = jax.vmap(dexsim_ppo.act, (None, 0, 0))
-    episode = jax.jit(lambda carry: jax.lax.scan(lambda c, x: each(policy.params, c, x), carry, obs))
-    last, actions = episode(policy.initial_carry(3))
-    np.testing.assert_allclose(actions, np.stack(expected), atol=1e-5)
-    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, atol=1e-5), last, carry)
-    one, action = dexsim_ppo.act(policy.params, policy.initial_carry(), obs[0, 0])
-    np.testing.assert_allclose(action, expected[0][0], atol=1e-5)
-    assert jax.tree.structure(one) == jax.tree.structure(carry)
 
 
 def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():

@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.core.config import Config, setting
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.learner.adapter import Plan
+from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.ppo import Training
 from dexsim_ppo.training import trainer
@@ -63,14 +63,13 @@ class TinyState:
     scale: jax.Array  # of the next episode's start
 
 
-class TinyEnv:
-    """The environment interface in forty lines."""
+class TinyEnv(Adapted):
+    """The learner's interface in thirty lines; episodes of an evaluation and their report are those of `Adapted`."""
 
     name = "tiny"
     action_size = 1
     control_period = 0.1
     evaluation_steps = 32
-    evaluation = "series"
     observation_layout = {
         group: (LayoutEntry("position", 1, None), LayoutEntry("target", 1, None), LayoutEntry("touch", 1, 2.0))
         for group in ("actor", "critic")
@@ -79,7 +78,7 @@ class TinyEnv:
     def __init__(self, config: TinyConfig | None = None, *, backend: str = "mjx"):
         self.config, self.backend = config or TinyConfig(), "mjx" if backend == "auto" else backend
 
-    def _start(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
+    def reset(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
         key, subkey = jax.random.split(key)
         scale, zero, false = jnp.float32(scale), jnp.float32(0), jnp.bool_(False)
         x, target = scale * jax.random.uniform(subkey, (2,), minval=-1.0, maxval=1.0)
@@ -90,9 +89,6 @@ class TinyEnv:
         obs = jnp.stack([state.x, state.target, jnp.maximum(state.x, 0.0)])
         return dataclasses.replace(state, obs={"actor": obs, "critic": obs})
 
-    def reset(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TinyState:
-        return self._start(key, scale)
-
     def set_randomization_scale(self, state: TinyState, scale: jax.Array) -> TinyState:
         return dataclasses.replace(state, scale=scale)
 
@@ -101,7 +97,7 @@ class TinyEnv:
         return dataclasses.replace(state, metrics=state.metrics | {"length": clock})
 
     def step(self, state: TinyState, action: jax.Array) -> TinyState:
-        x = state.x + self.config.gain * jnp.clip(action[0], -1.0, 1.0)
+        x = state.x + self.config.gain * action[0]  # Whoever steps it keeps to [-1, 1].
         error = jnp.abs(x - state.target)
         length = state.metrics["length"] + 1
         metrics = {
@@ -123,20 +119,14 @@ class TinyEnv:
         )
 
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
-        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key, state.scale), state)
+        return jax.tree.map(lambda new, old: jnp.where(done, new, old), self.reset(state.key, state.scale), state)
 
-    def evaluation_plan(self, count: int, seed: int) -> Plan:
-        return Plan(jax.random.split(jax.random.key(seed), count), np.arange(count))
 
-    def evaluation_starts(self, plan: Plan) -> TinyState:
-        return jax.vmap(self._start)(plan.key)
-
-    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
-        error = float(metrics["error"][alive].mean())
-        return {"error": error, "headline": {"error": error}}
-
-    def snapshot(self, state: TinyState) -> dict[str, jax.Array]:
-        return {"x": state.x}
+def leaves(tree: Any) -> dict[str, np.ndarray]:
+    """All numbers of a pytree by path; random keys as their data."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    named = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(p): np.asarray(jax.random.key_data(x) if is_key(x) else x) for p, x in named}
 
 
 # Runs and tests with the same settings share their environment and its compiled programs.

@@ -1,4 +1,4 @@
-"""What an iteration does around the loss: shuffling, clipping, statistics, the actions that the environment gets."""
+"""What an iteration does around the loss: shuffling, clipping, statistics."""
 
 import dataclasses
 import functools
@@ -10,7 +10,7 @@ import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner import ppo, running_stats, update
+from dexsim_ppo.learner import running_stats, update
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.loss import Samples
@@ -113,53 +113,66 @@ def test_log_std_stays_between_floor_and_cap(learner):
         np.testing.assert_allclose(jnp.exp(moved.params.log_std), bound, rtol=1e-5)
 
 
-# Actions beyond what the environment takes; one update.
-WIDE = dataclasses.replace(SMALL, initial_std=1.0, epochs=1, minibatches=1)
+# --- seven iterations of one update each, with ranges that widen with success ------------------------------
+
+RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
 
 class Watched(TinyEnv):
-    """Shows the actor the action that it got, and the critic other numbers than the actor."""
+    """Shows the critic other numbers than the actor; all episodes begin and end together."""
 
     def _observe(self, state):
         state = super()._observe(state)
         return dataclasses.replace(state, obs={"actor": state.obs["actor"], "critic": 3.0 * state.obs["actor"] + 5.0})
 
-    def step(self, state, action):
-        state = super().step(state, action)
-        return dataclasses.replace(state, obs=state.obs | {"actor": state.obs["actor"].at[0].set(action[0])})
+    def randomize_episode_time(self, state, key):
+        return state
 
 
-def test_every_group_has_the_statistics_of_its_own_observations():
-    training = training_of(WIDE, Watched)
-    after, _ = training.step(training.init(jax.random.key(0)))
-    actor, critic = (after.observation_stats[group] for group in ("actor", "critic"))
-    np.testing.assert_allclose(critic.mean[1:], 3 * actor.mean[1:] + 5, rtol=1e-4)
-    np.testing.assert_allclose(critic.variance[1:], 9 * actor.variance[1:], rtol=1e-3)
+@pytest.fixture(scope="module")
+def watched():
+    """The last state, and each iteration's metrics."""
+    training = make_train(
+        Watched(TinyConfig(horizon=4)), dataclasses.replace(SMALL, initial_std=1.0, epochs=1, minibatches=1), RULES
+    )
+    state, rows = training.init(jax.random.key(0)), []
+    for _ in range(7):
+        state, metrics = training.step(state)
+        rows.append({name: float(value[0]) for name, value in metrics.items()})
+    assert training.step._cache_size() == 1
+    return state, rows
+
+
+def test_every_group_has_the_statistics_of_its_own_observations(watched):
+    actor, critic = (watched[0].observation_stats[group] for group in ("actor", "critic"))
+    np.testing.assert_allclose(critic.mean, 3 * actor.mean + 5, rtol=1e-4)
+    np.testing.assert_allclose(critic.variance, 9 * actor.variance, rtol=1e-3)
     assert np.all(np.asarray(actor.variance) > 1e-3)
 
 
-def test_the_first_minibatch_meets_the_policy_that_collected_it():
+def test_the_first_minibatch_meets_the_policy_that_collected_it(watched):
     """With the normalisers of the collection: the divergence is zero, and no ratio is clipped."""
-    training = training_of(WIDE, Watched)
-    state = training.init(jax.random.key(0))
-    for _ in range(3):
-        state, metrics = training.step(state)
-        assert abs(float(metrics["kl"][0])) < 1e-6 and float(metrics["clip_fraction"][0]) == 0.0
+    for row in watched[1]:
+        assert abs(row["kl"]) < 1e-6 and row["clip_fraction"] == 0.0
 
 
-def test_the_environment_gets_the_action_clipped():
-    env, state = Watched(), training_of(WIDE, Watched).init(jax.random.key(0))
+def test_ranges_widen_with_success_and_episodes_update_scale(watched):
+    state, rows = watched
+    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
+    assert all(row["curriculum/success"] == 1 for row in rows)
+    np.testing.assert_allclose(state.scale, 1.0)
+    np.testing.assert_array_equal(state.env_state.scale, np.ones(SMALL.num_envs, np.float32))
+    # Two episodes of four steps in an iteration of eight: both are drawn at the scale that it began with.
+    np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
 
-    @jax.jit
-    def collect(state, key):
-        return ppo.collect_rollout(env, WIDE, dataclasses.replace(state, key=key))
 
-    _, rollout, _ = collect(state, jax.random.key(1))
-    drawn = np.asarray(rollout.decision.action[:-1, :, 0])
-    going_on = ~np.asarray(rollout.terminated | rollout.truncated)[:-1]
-    assert np.any(np.abs(drawn[going_on]) > 1.3)
-    got = np.asarray(rollout.obs["actor"][1:, :, 0])
-    np.testing.assert_allclose(got[going_on], np.clip(drawn, -1, 1)[going_on], rtol=1e-5, atol=1e-6)
+def test_no_ended_episode_says_nothing_and_an_unknown_metric_is_named():
+    """`training/test_presets.py` has a metric by name."""
+    metrics = {"terminated_share": jnp.float32(jnp.nan), "episode/goals": jnp.float32(7.0)}
+    scale, success = update_scale(RULES, jnp.float32(0.5), metrics)
+    assert np.isnan(success) and float(scale) == 0.5
+    with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
+        update_scale(dataclasses.replace(RULES, metric="step/luck"), scale, metrics)
 
 
 def test_training_begins_amid_episodes():
@@ -183,93 +196,41 @@ def test_rewards_beyond_a_hundred_deviations_of_returns_are_bounded_and_others_s
 # --- formulas; `test_composed_objective.py` has the others ------------------------------------------------
 
 
-def merged(stats, batch):
-    axes = tuple(range(batch.ndim - stats.mean.ndim))
-    return merge_moments(stats, batch.mean(axes), batch.var(axes), batch.size // stats.mean.size)
+def test_memory_fades_over_a_full_count():
+    """A sample's weight is never below one in `MEMORY`; the count neither overflows nor freezes."""
+    merged = lambda stats, value, size: merge_moments(stats, jnp.float32(value), jnp.zeros(()), size)  # noqa: E731
+    full = RunningStats(jnp.int32(running_stats.MEMORY), jnp.zeros(()), jnp.ones(()))
+    assert float(merged(full, 1, 2**20).mean) == pytest.approx(1 / 129, rel=1e-4)
+    stats, _ = jax.lax.scan(lambda s, _: (merged(s, 2, 64 * 1024), None), full, None, length=10_000)
+    assert int(stats.count) > 0 and float(stats.mean) == pytest.approx(2.0, rel=0.02)
 
 
-class TestRunningStats:
-    def test_memory_fades_over_a_full_count(self):
-        """A sample's weight is never below one in `MEMORY`; the count neither overflows nor freezes."""
-        full = RunningStats(jnp.int32(running_stats.MEMORY), jnp.zeros(()), jnp.ones(()))
-        assert float(merged(full, jnp.full(2**20, 1.0)).mean) == pytest.approx(1 / 129, rel=1e-4)
-        stats, _ = jax.lax.scan(lambda s, _: (merged(s, jnp.full((64, 1024), 2.0)), None), full, None, length=10_000)
-        assert int(stats.count) > 0 and float(stats.mean) == pytest.approx(2.0, rel=0.02)
-
-    def test_a_column_that_is_not_finite_stays_unchanged(self):
-        stats = merged(init_stats((2,)), jnp.array([[1.0, 2.0], [3.0, jnp.nan]]))
-        np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
+def test_statistics_of_a_column_that_is_not_finite_stay_unchanged():
+    stats = merge_moments(init_stats((2,)), jnp.array([2.0, jnp.nan]), jnp.array([1.0, jnp.nan]), 2)
+    np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
 
 
-def test_against_numpy():
+def test_adam_against_numpy():
     rng = np.random.default_rng(0)
-    params = {"a": rng.normal(size=3), "b": rng.normal(size=(2, 2))}
-    grads = [{k: rng.normal(size=v.shape) for k, v in params.items()} for _ in range(5)]
-    single = lambda tree: jax.tree.map(jnp.float32, tree)  # noqa: E731
-    state, got = init_adam(single(params)), single(params)
-    moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
-    for t, grad in enumerate(grads, start=1):
-        got, state = step_adam(single(grad), state, got, 0.01)
-        for k, g in grad.items():
-            m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
-            moments[k] = m, v
-            params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-5)
-    for k in params:
-        np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
+    parameters, mean, square = rng.normal(size=3), 0.0, 0.0
+    got = jnp.float32(parameters)
+    state = init_adam(got)
+    for t, grad in enumerate(rng.normal(size=(5, 3)), start=1):
+        got, state = step_adam(jnp.float32(grad), state, got, 0.01)
+        mean, square = 0.9 * mean + 0.1 * grad, 0.999 * square + 0.001 * grad**2
+        parameters = parameters - 0.01 * (mean / (1 - 0.9**t)) / (np.sqrt(square / (1 - 0.999**t)) + 1e-5)
+    np.testing.assert_allclose(got, parameters, rtol=1e-5, atol=1e-6)
 
 
 def test_learning_rate_adapts_within_its_band():
     config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
     rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl), 0))  # noqa: E731
     assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
-    config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
-    wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
-    assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
-    halved = dataclasses.replace(config, kl_target=0.04, kl_halving=100)
+    wide = {"learning_rate_min": 1e-5, "learning_rate_max": 1e-1}
+    halved = dataclasses.replace(config, kl_target=0.04, kl_halving=100, **wide)
     for iteration, target in ((0, 0.04), (100, 0.02), (300, 0.01)):
         for share, factor in ((0.49, 1.5), (0.51, 1.0), (1.99, 1.0), (2.01, 1 / 1.5)):
             after = adapt_learning_rate(halved, jnp.float32(1e-3), jnp.float32(share * target), iteration)
             assert float(after) == pytest.approx(1e-3 * factor), (iteration, share)
     fixed = dataclasses.replace(config, kl_target=0.0)
     assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
-
-
-# --- the curriculum: ranges that widen with success, carried in the training state ------------------------
-
-RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
-
-
-class Together(TinyEnv):
-    """All episodes begin and end together."""
-
-    def randomize_episode_time(self, state, key):
-        return state
-
-
-def run(env, rules, iterations):
-    training = make_train(env, SMALL, rules)
-    state, rows = training.init(jax.random.key(0)), []
-    for _ in range(iterations):
-        state, metrics = training.step(state)
-        rows.append({name: float(value[0]) for name, value in metrics.items()})
-    assert training.step._cache_size() == 1
-    return state, rows
-
-
-def test_ranges_widen_with_success_and_episodes_update_scale():
-    state, rows = run(Together(TinyConfig(horizon=4)), RULES, 7)
-    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
-    assert all(row["curriculum/success"] == 1 for row in rows)
-    np.testing.assert_allclose(state.scale, 1.0)
-    np.testing.assert_array_equal(state.env_state.scale, np.ones(SMALL.num_envs, np.float32))
-    # Two episodes of four steps in an iteration of eight: both are drawn at the scale that it began with.
-    np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
-
-
-def test_no_ended_episode_says_nothing_and_an_unknown_metric_is_named():
-    """`training/test_presets.py` has a metric by name."""
-    metrics = {"terminated_share": jnp.float32(jnp.nan), "episode/goals": jnp.float32(7.0)}
-    scale, success = update_scale(RULES, jnp.float32(0.5), metrics)
-    assert np.isnan(success) and float(scale) == 0.5
-    with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
-        update_scale(dataclasses.replace(RULES, metric="step/luck"), scale, metrics)

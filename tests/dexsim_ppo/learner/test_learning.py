@@ -48,7 +48,7 @@ class BadRewards(TinyEnv):
 
     def restart(self, state, done):
         key, fresh_key = jax.random.split(state.key)
-        return choose(done, self._start(fresh_key), dataclasses.replace(state, key=key))
+        return choose(done, self.reset(fresh_key), dataclasses.replace(state, key=key))
 
     def step(self, state, action):
         state = super().step(state, action)

@@ -1,4 +1,5 @@
-"""The command in two processes, and one of them killed: the training of one device, up to the order of sums."""
+"""Two processes, one of them killed: the training of one device, up to the order of sums. On a GPU numbers stay finite,
+episodes end and begin; `--deterministic` repeats to the bit."""
 
 import os
 import socket
@@ -6,23 +7,18 @@ import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 import tiny_train
 from paths import ROOT
+from tiny_env import leaves
 
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 OPTIONS = [*tiny_train.QUICK, "--checkpoint-every", "5"]
 ITERATIONS = 20
 STEPS = ["--steps", str(ITERATIONS * 16 * 8)]
-
-
-@pytest.fixture(autouse=True)
-def tiny_task(monkeypatch):
-    tiny_train.install(monkeypatch)
 
 
 def start_two(*options):
@@ -39,16 +35,8 @@ def start_two(*options):
     return [subprocess.Popen(command, env={**os.environ, **job, **path, **number}, **pipes) for number in numbers]
 
 
-def last_state(folder):
-    """All numbers of the last checkpoint, by path; random keys as their data."""
-    leaves = checkpoint.load(folder.latest_checkpoint(), kind="train").leaves
-    return {
-        name: np.asarray(jax.random.key_data(x) if jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
-        for name, x in leaves.items()
-    }
-
-
 @pytest.mark.slow
+@pytest.mark.usefixtures("tiny_task")
 def test_a_killed_process_ends_the_run_and_it_can_be_resumed(tmp_path):
     folder = RunFolder(tmp_path / "run")
     runs = start_two(*OPTIONS, "--minutes", 3, "--keep-checkpoints", 1000, "--run-dir", folder.path)
@@ -67,8 +55,34 @@ def test_a_killed_process_ends_the_run_and_it_can_be_resumed(tmp_path):
         if path != folder.checkpoint(5):
             path.unlink()
     assert train.main(["--resume", str(folder.path), *STEPS, "--minutes", "0", "--devices", "1"]) == 0
-    mine, theirs = last_state(folder), last_state(tiny_train.finished_run(tmp_path / "alone", *OPTIONS, *STEPS))
-    assert mine.keys() == theirs.keys() and int(mine[".iteration"]) == ITERATIONS
-    assert not np.array_equal(mine[".params.log_std"], np.full(1, np.log(0.6), np.float32))
+    alone = tiny_train.finished_run(tmp_path / "alone", *OPTIONS, *STEPS)
+    mine, theirs = (leaves(checkpoint.load(run.latest_checkpoint(), kind="train").leaves) for run in (folder, alone))
+    assert mine.keys() == theirs.keys() and int(mine["['.iteration']"]) == ITERATIONS
+    assert not np.array_equal(mine["['.params.log_std']"], np.full(1, np.log(0.6), np.float32))
     for name, leaf in mine.items():
         np.testing.assert_allclose(leaf, theirs[name], rtol=2e-3, atol=2e-4, err_msg=name)
+
+
+ENVS, TICKS = 64, 16  # rollouts on a GPU
+
+
+@pytest.mark.gpu
+def test_training_on_a_gpu_repeats_to_the_bit(tmp_path):
+    """Each run in a process of its own, which starts XLA anew."""
+    command = [sys.executable, "-m", "dexsim_ppo.train", "--task", "grasp", "--deterministic", "--preset", "gpu"]
+    command += ["--ppo.num-envs", ENVS, "--ppo.rollout-length", TICKS, "--ppo.iterations-per-call", 1]
+    command += ["--steps", ENVS * TICKS * 2, "--env.pool-size", 80, "--env.episode-seconds", 0.6, "--no-video"]
+    command += ["--evaluation-chunk", 32, "--evaluation-episodes", 32, "--evaluate-every", 0, "--log-every", 1]
+    saved = []
+    for name in ("first", "second"):
+        folder = RunFolder(tmp_path / name)
+        subprocess.run([str(part) for part in [*command, "--run-dir", folder.path]], cwd=ROOT, check=True)
+        saved.append(checkpoint.load(folder.latest_checkpoint(), kind="train").leaves)
+    bits = [{name: leaf.tobytes() for name, leaf in leaves(one).items()} for one in saved]
+    assert bits[0] == bits[1]
+    rows = read_metrics(folder.metrics)
+    assert len(rows) == 2 and rows[-1]["skipped_updates"] == 0
+    for name in ("policy_loss", "value_loss", "kl", "explained_variance"):
+        assert all(np.isfinite(row[name]) for row in rows), name
+    assert sum(row["episodes"] for row in rows) >= ENVS, "episodes of 20 ticks end within 32 ticks"
+    assert np.max(saved[0][".env_state.finger_force"]) > 0.5, "no hand has touched anything"

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_train
 from test_train import QUICK, exit_code
-from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv, training_of
+from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
 
 from dexsim_ppo import train
 from dexsim_ppo.learner.ppo import make_train
@@ -18,19 +17,6 @@ from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.arguments import fine_tuning_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import initialize_from
-
-
-@pytest.fixture(scope="module")
-def policy():
-    """The integrator, hardly trained."""
-    training = training_of()
-    state, _ = training.step(training.init(jax.random.key(0)))
-    return Policy.from_training(TinyEnv(), SMALL, state)
-
-
-@pytest.fixture
-def tiny_task(monkeypatch):
-    tiny_train.install(monkeypatch)
 
 
 def started(policy, config, env=None):

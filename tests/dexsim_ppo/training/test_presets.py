@@ -53,6 +53,7 @@ def test_default_settings_are_those_that_trained_the_tasks(name, task):
     assert (*sizes, *rates, ppo.actor_layers, ppo.memory, *budget) == TRAINED[name, task]
     assert ppo.critic_layers == ppo.actor_layers
     assert {field: getattr(ppo, field) for field in COMMON} == COMMON
+    assert preset.curriculum.on == (task == "rotate" and name != "gpu")
     assert preset.extremes == (0.6 if name == "gpu" and task != "rotate_any" else 0.0)
 
 
@@ -102,12 +103,8 @@ def test_the_ranges_of_rotation_widen_after_five_goals_and_narrow_below_half_of_
     assert rules.start == 0.1
 
 
-def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
-    """And no other training does, fine-tuning included: its policy knows the full ranges."""
-    for name, task, widens in (("cpu", "rotate", True), ("cpu-large", "rotate", True), ("gpu", "rotate", False)):
-        preset = find_preset(name, task)
-        assert preset.curriculum.on == widens and bool(preset.ppo.kl_halving) == widens
-    assert not find_preset("cpu", "rotate_without_orientation").curriculum.on, "fewer turns than the threshold"
-    assert not find_preset("cpu", "grasp").curriculum.on
+def test_fine_tuning_keeps_the_full_ranges():
+    """Its policy knows them; nor does a task with fewer turns than the threshold begin on narrow ones."""
+    assert not find_preset("cpu", "rotate_without_orientation").curriculum.on
     scratch, tuned = (train.default_arguments("rotate", "cpu", begun) for begun in (None, load_policy("rotate")))
     assert scratch.curriculum.on and not tuned.curriculum.on and not tuned.ppo.kl_halving

@@ -26,9 +26,7 @@ from dexsim_ppo.training.trainer import SELECTION_SEED
 QUICK = [*tiny_train.QUICK, *"--evaluate-every 4 --evaluation-share 1 --log-every 2 --checkpoint-every 3".split()]
 
 
-@pytest.fixture(autouse=True)
-def tiny_task(monkeypatch):
-    tiny_train.install(monkeypatch)
+pytestmark = pytest.mark.usefixtures("tiny_task")
 
 
 @pytest.fixture(scope="module")
@@ -138,14 +136,11 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path):
 
 
 TRAIN_ERRORS = {
-    "wrong type": (["--ppo.discount", "much"], "--ppo.discount: could not convert string to float: 'much'"),
     "out of range": (["--ppo.discount", "1.5"], "discount = 1.5: must be between 0 and 1"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
     "folder of a run": (["--run-dir", "RUN"], "exists already"),
     "another task": (["--task", "grasp", "--resume", "RUN"], "of the task 'tiny', not 'grasp'"),
-    "no end": (["--config", "/dev/zero"], "larger than 1 MiB"),
     "another seed": (["--resume", "RUN", "--seed", "9"], "--seed 9: a resumed run keeps its 0"),
-    "another learner": (["--resume", "RUN", "--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed"),
 }
 EVALUATE_ERRORS = {
     "cut short": (["broken.msgpack"], "cut short"),
@@ -170,8 +165,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(what, finished, tmp_path, 
     assert exit_code(main, arguments) == 2
     error = capsys.readouterr().err
     assert words.lower() in error.lower(), error
-    # What does not parse is tyro's to explain, in a box of several lines.
-    assert what == "train: wrong type" or error.count("\n") == 1 and error.startswith("error: "), error
+    assert error.count("\n") == 1 and error.startswith("error: "), error
     assert before == contents(finished)
     assert [p.name for p in tmp_path.iterdir()] == ["broken.msgpack"]
 
@@ -207,32 +201,21 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys):
     assert folder.latest_checkpoint().exists()
 
 
-FAULTY = [*tiny_train.QUICK, *"--seed 3 --log-every 1".split()]
+FAULTY = [*tiny_train.QUICK, *"--seed 3 --log-every 1 --env.horizon 9999 --env.wall 9999".split()]  # no episode ends
 GOOD_ITERATIONS = 3
 
 
 class Breaks(TinyEnv):
     """From its 24th step on, the actors of environments that started on the right side observe NaN."""
 
-    def _start(self, key, *scale):
-        state = super()._start(key, *scale)
-        return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
-
     def randomize_episode_time(self, state, key):
         return state
 
     def step(self, state, action):
-        age = state.metrics["age"] + 1
         state = super().step(state, action)
-        broken = (age >= 8 * GOOD_ITERATIONS) & (state.target > 0.0)
+        broken = (state.metrics["length"] >= 8 * GOOD_ITERATIONS) & (state.target > 0.0)
         actor = state.obs["actor"].at[1].set(jnp.where(broken, jnp.nan, state.obs["actor"][1]))
-        return dataclasses.replace(
-            state,
-            obs=state.obs | {"actor": actor},
-            truncated=jnp.bool_(False),
-            terminated=jnp.bool_(False),
-            metrics=state.metrics | {"age": age},
-        )
+        return dataclasses.replace(state, obs=state.obs | {"actor": actor})
 
 
 def test_a_run_that_diverges_ends_and_names_what_is_from_before(tmp_path, monkeypatch):
