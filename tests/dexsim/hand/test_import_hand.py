@@ -193,11 +193,6 @@ REFUSED = {
     "no such palm": ({}, dict(palm="hand"), "--palm hand: no such body; it has palm, thumb"),
     "no such joint": ({}, dict(freeze=("wrist",)), "--freeze wrist: no such joint; it has thumb_a"),
     "couple": ({}, dict(couple=("f_b",)), "--couple f_b: expected FOLLOWER=LEADER:RATIO"),
-    "polynomial": (
-        dict(tail='<equality><joint joint1="f_b" joint2="f_a" polycoef="0 1 0.2 0 0"/></equality>'),
-        {},
-        "'f_b' follows 'f_a' by the polycoef",
-    ),
 }
 
 

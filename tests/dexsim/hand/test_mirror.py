@@ -19,7 +19,7 @@ from dexsim.hand import mirror
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import find_hand, load_hand
-from dexsim.hand.mirror import AXIAL, MATRIX, POLAR, is_mirror_image, mirror_hand, mirror_mjcf, swap_sides, write_mirror
+from dexsim.hand.mirror import AXIAL, MATRIX, POLAR, is_mirror_image, mirror_hand, mirror_mjcf, write_mirror
 from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, mirror_readings, observe
 
 HANDS = ("xhand_right", "leap_like", "inspire_like")
@@ -147,10 +147,6 @@ def test_every_way_to_write_an_mjcf_is_mirrored(tmp_path):
     np.testing.assert_allclose(there.xmat.reshape(-1, 3, 3), here.xmat.reshape(-1, 3, 3) * MATRIX, atol=1e-9)
     np.testing.assert_allclose(there.qfrc_bias, here.qfrc_bias, atol=1e-9)  # gravity has no y
     assert other.body("left_palm").id and other.body("Left_thumb").id and other.site("left_tip").id == 0
-
-
-def test_names_of_sides_are_words():
-    assert swap_sides("right_hand Left RIGHT bright right2 left") == "left_hand Right LEFT bright left2 right"
 
 
 def test_an_existing_hand_is_not_overwritten(tmp_path):

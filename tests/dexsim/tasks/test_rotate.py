@@ -39,12 +39,6 @@ def quat_of(rotation: Rotation) -> np.ndarray:
 draw_object = jax.jit(sample_turned_object, static_argnums=1)
 
 
-def truth(task: Rotate, **changes) -> GroundTruth:
-    """The cube at the reference, aligned and at rest, in a hand that touches nothing."""
-    object = draw_object(jax.random.key(0), RotateConfig())
-    return still_moment(task.hand, task.reference, object=object, **changes)
-
-
 def turned(degrees: float, axis=(1, 0, 0)) -> np.ndarray:
     return quat_of(Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis)))
 
@@ -64,7 +58,9 @@ class Rules:
         self.waiting = jax.tree.map(lambda x: x[0], self.task.evaluation_plan(1, np.zeros(4, int))[1])
 
     def truth(self, **changes) -> GroundTruth:
-        return truth(self.task, **changes)
+        """The cube at the reference, aligned and at rest, in a hand that touches nothing."""
+        cube = draw_object(jax.random.key(0), RotateConfig())
+        return still_moment(self.task.hand, self.task.reference, object=cube, **changes)
 
     def rewards(self, goal, here, dropped=False):
         """Reward and its terms and metrics."""
