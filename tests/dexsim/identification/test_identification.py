@@ -98,17 +98,6 @@ def test_latency_holdout_and_report():
         assert word in result.report()
 
 
-@pytest.mark.slow
-def test_a_dead_band_is_found():
-    log = log_of(TRUTH, 6, target=SHORT)
-    known = TRUTH | dict(stiffness=3.5, damping=0.13, coulomb_friction=0.0, dead_band=0.0)
-    result = identify(log, known, fit=("stiffness", "damping", "coulomb_friction"), latencies=(2,))
-    assert result.rmse < 0.0011
-    for name in result.fitted:
-        low, high = result.intervals[name]
-        assert low <= TRUTH[name] <= high and high - low < 0.5 * TRUTH[name] + 2e-3, name
-
-
 def c_log(truth, target, latency, timestep=5e-4, seed=0):
     """A log from C MuJoCo: hinge with frictionloss and damping, the PD law in its actuator, finer steps."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -254,14 +243,10 @@ def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
     ("changes", "says"),
     [
         (dict(target=TARGET[:100], position=TARGET[:100]), "at least 200 samples"),
-        (dict(position=TARGET[:-1]), "arrays of one length"),
-        (dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)), "not a number"),
         (dict(period=15.0), "period of 15 s: give seconds"),
         (dict(position=np.rad2deg(TARGET), target=np.rad2deg(TARGET)), "give rad"),
         (dict(target=TARGET / 57.3), "same unit"),
-        (dict(position=0 * TARGET + 0.9), "moved over 0 rad"),
         (dict(torque=np.where(np.arange(len(TARGET)) % 3 < 2, 0.4, 0.1)), "saturated"),
-        (dict(torque=1e3 * np.sin(np.arange(len(TARGET)))), "give Nm"),
     ],
 )
 def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
