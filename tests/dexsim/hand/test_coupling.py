@@ -114,11 +114,6 @@ REFUSED = {
     "chain": (COUPLE_A, COUPLE_A.replace('joint2="a"', 'joint2="b_next"'), "follows 'b_next'.*no motor"),
     "beyond its range": ('range="-2 2"', 'range="-2 0.5"', "'b_next' has the range -2 to 0.5 rad.*to 0.81"),
     "none": (COUPLE_A, "", "lists 2 of the 3 joints"),
-    "tendon": (
-        "<equality>",
-        '<tendon><fixed name="string"><joint joint="a" coef="1"/></fixed></tendon><equality>',
-        "tendon 'string'",
-    ),
 }
 
 
