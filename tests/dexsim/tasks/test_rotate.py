@@ -337,21 +337,15 @@ class TestDrop:
                 here = of.truth(object_position=of.reference + [0, 0, distance])
                 assert bool(of.dropped(goal, here)) == lost
 
-    def test_lowest_corner_of_a_tilted_cube(self):
-        target = draw_object(jax.random.key(3), RotateConfig())
-        half, place = float(target.size[0, 0]), np.array([0.06, 0.0, 0.08])
-        corners = half * CORNERS
-        for seed in range(5):
-            rotation = Rotation.random(random_state=seed)
-            low = np.min(rotation.apply(corners)[:, 0]) + place[0]
-            np.testing.assert_allclose(lowest_point(target, quat_of(rotation), jnp.asarray(place)), low, atol=1e-6)
-
-    def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand, rules_of):
-        rules = rules_of(RotateConfig(support="fingers"))
-        height = palm_height(hand) + float(rules.truth().object.size[0, 0])
+    @pytest.mark.parametrize("turn", [(0, 0, 0), (0.5, 0.4, 0), (-0.3, 0.2, 0.6)])
+    def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand, rules_of, turn):
+        """By its lowest corner."""
+        rules, rotation = rules_of(RotateConfig(support="fingers")), Rotation.from_rotvec(turn)
+        reach = float(rules.truth().object.size[0, 0]) * np.max(rotation.apply(CORNERS)[:, 0])
         for gap, lost in ((0.0005, True), (0.0015, False)):
-            place = rules.reference * [0, 1, 1] + [height + gap, 0, 0]
-            assert bool(rules.dropped(rules.begun, rules.truth(object_position=place))) == lost
+            place = rules.reference * [0, 1, 1] + [palm_height(hand) + reach + gap, 0, 0]
+            here = rules.truth(object_position=place, object_quat=quat_of(rotation))
+            assert bool(rules.dropped(rules.begun, here)) == lost
 
 
 def test_boxes_and_cylinders_have_the_inertia_that_mujoco_computes():

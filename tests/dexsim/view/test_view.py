@@ -27,17 +27,11 @@ from dexsim_ppo import load_policy
 class Gui(dict):
     """Controls by their names, without a page."""
 
-    def add_slider(self, name, *, initial_value, **limits):
-        self[name] = SimpleNamespace(value=initial_value, **limits)
+    def add(self, name, options=(False,), *, initial_value=None, **limits):
+        self[name] = SimpleNamespace(value=options[0] if initial_value is None else initial_value, **limits)
         return self[name]
 
-    def add_dropdown(self, name, options):
-        self[name] = SimpleNamespace(value=options[0], options=options)
-        return self[name]
-
-    def add_button(self, name):
-        self[name] = SimpleNamespace(value=False)
-        return self[name]
+    add_slider = add_dropdown = add_button = add
 
 
 def open_with_controls(**arguments):
