@@ -96,12 +96,8 @@ class TestGoal:
             here = rules.truth(**{"object_quat": turned(90)} | changes)
             return bool(rules.progress(rules.begun, here).success)
 
-        assert [reached(object_quat=turned(angle)) for angle in (72.5, 73.5, 106.5, 107.5)] == [
-            False,
-            True,
-            True,
-            False,
-        ]
+        for angle, inside in ((72.5, False), (73.5, True), (106.5, True), (107.5, False)):
+            assert reached(object_quat=turned(angle)) == inside
         assert reached(object_position=rules.reference + [0, 0.049, 0])
         assert not reached(object_position=rules.reference + [0, 0.051, 0])
         assert reached(object_spin=[1.9, 5, 5])
@@ -134,18 +130,11 @@ def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
 class TestReward:
     def test_the_papers_reward_is_its_three_terms(self, rules_of):
         assert paper().control.last_action_encoding == "action"
-        rules, action = rules_of(paper()), np.linspace(-1, 1, 12).astype(np.float32)
-        busy = dict(
-            action=action,
-            joint_velocity=np.full(12, 3.0),
-            joint_torque=np.full(12, 0.5),
-            finger_force=np.full((5, 3), 2.0),
-            object_spin=[9.0, 0, 0],
-        )
-        cost = -0.0002 * float(np.sum(action**2))
+        rules, action = rules_of(paper()), np.linspace(-1, 1, 12)
         for degrees, earned in ((45, 1 / (math.pi / 4 + 0.1)), (90, 250 + 1 / 0.1)):
-            reward, _ = rules.rewards(rules.begun, rules.truth(object_quat=turned(degrees), **busy))
-            np.testing.assert_allclose(reward, earned + cost, rtol=1e-4)
+            busy = moment(rules, action=action, object_spin=[9.0, 0, 0], object_quat=turned(degrees))
+            reward, _ = rules.rewards(rules.begun, busy)
+            np.testing.assert_allclose(reward, earned - 0.0002 * np.sum(action**2), rtol=1e-4)
 
     def test_fingertips_at_work_earn_the_rest_of_the_bonus(self, rules):
         tips = RotateReward().bonus_tips

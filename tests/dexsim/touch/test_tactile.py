@@ -161,7 +161,7 @@ def test_every_method_feels_the_same_grasp(hand, links, method):
     exact, force, centre = feel(BALL, skin)
     other = bake(BALL, nodes=48) if method == "grid" else surface_points.from_shape(BALL, 2048)
     ours, other_force, other_centre = feel(other, skin)
-    bound = {"grid": 2.5e-5, "surface_points": 8e-5}[method]
+    bound = {"grid": 1.5e-5, "surface_points": 8e-5}[method]
     np.testing.assert_allclose(ours.depth, exact.depth, atol=bound)
     np.testing.assert_allclose(other_force, force, rtol=1e-5)
     np.testing.assert_allclose(other_centre, centre, atol=1.5e-4)
