@@ -24,17 +24,16 @@ ROOTS = {"index": (0, 0.035, 0.09), "middle": (0, 0.01, 0.095), "ring": (0, -0.0
 LENGTHS = (0.04, 0.03)
 
 
-def urdf(folder, *, name="hand", reverse=(), turn=TURN, effort="0.6", extra="", meshes=True, mirror=False):
+def urdf(folder, *, reverse=(), turn=TURN, effort="0.6", mirror=False):
     """A hand of eleven motors and a wrist: three fingers of two hinges that a hinge spreads, and a thumb that turns and
     bends twice. Meshes are STL of a package, one of the links is a box."""
     (folder / "meshes").mkdir(exist_ok=True)
     side = np.diag([1.0, -1.0, 1.0]) if mirror else np.eye(3)
-    if meshes:
-        for part, length in enumerate(LENGTHS):
-            bar = trimesh.creation.capsule(height=length - 0.01, radius=0.009, count=[16, 16])
-            bar.apply_translation([0, 0, length / 2 - bar.bounds.mean(0)[2]])
-            bar.apply_transform(transform(turn))
-            bar.export(folder / "meshes" / f"bar{part}.stl")
+    for part, length in enumerate(LENGTHS):
+        bar = trimesh.creation.capsule(height=length - 0.01, radius=0.009, count=[16, 16])
+        bar.apply_translation([0, 0, length / 2 - bar.bounds.mean(0)[2]])
+        bar.vertices = bar.vertices @ turn.T
+        bar.export(folder / "meshes" / f"bar{part}.stl")
     rpy = " ".join(f"{x:.9f}" for x in Rotation.from_matrix(turn).as_euler("xyz"))
     palm = '<visual><origin xyz="{}" rpy="{}"/><geometry><box size="0.03 0.1 0.1"/></geometry></visual>'
     links = [
@@ -59,12 +58,12 @@ def urdf(folder, *, name="hand", reverse=(), turn=TURN, effort="0.6", extra="", 
             length = 0.0 if part == 0 else LENGTHS[part - 1]
             way = np.array([0, 0, 1.0]) if not thumb else side @ np.array([0, 0.8, 0.6])
             tilt = Rotation.align_vectors([turn @ way], [turn @ [0, 0, 1.0]])[0].as_euler("xyz")
-            file = f'<mesh filename="package://{name}_description/meshes/bar{part - 1}.stl"/>'
+            file = f'<mesh filename="package://hand_description/meshes/bar{part - 1}.stl"/>'
             shape = f'<origin rpy="{vector(tilt)}"/><geometry>{file}</geometry>'
             links.append(f'<link name="{child}">' + (f"<visual>{shape}</visual>" if part else "") + "</link>")
             above, place = child, length * way
-    path = folder / f"{name}.urdf"
-    path.write_text(f'<robot name="{name}">{"".join(links)}{"".join(joints)}{extra}</robot>')
+    path = folder / "hand.urdf"
+    path.write_text(f'<robot name="hand">{"".join(links)}{"".join(joints)}</robot>')
     return path
 
 
@@ -78,12 +77,6 @@ def joint(name, parent, child, place, axis, span, effort):
 
 def vector(values):
     return " ".join(f"{x:.9f}" for x in values)
-
-
-def transform(turn):
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn
-    return matrix
 
 
 def draft_of(path):

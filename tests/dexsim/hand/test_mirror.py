@@ -36,11 +36,8 @@ def same(one: Hand, other: Hand, *apart: str) -> None:
         a, b = getattr(one, field.name), getattr(other, field.name)
         if isinstance(a, np.ndarray) and field.name not in apart:
             np.testing.assert_array_equal(a, b, err_msg=field.name)
-    assert (one.side, one.grasp_centre, one.rotate_reference) == (
-        other.side,
-        other.grasp_centre,
-        other.rotate_reference,
-    )
+    for name in ("side", "grasp_centre", "rotate_reference"):
+        assert getattr(one, name) == getattr(other, name)
     for a, b in zip(one.geoms, other.geoms, strict=True):
         for name in ("size", "position", "rotation"):
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-7)
