@@ -153,9 +153,7 @@ BROKEN = {
     "misspelt entry": ("toml", "palm = ", "taxel_pich = 1\npalm = ", "'taxel_pich'"),
     "posture in degrees": ("toml", "posture = [1.45", "posture = [83", "83 rad of 'thumb_bend'"),
     "not a number": ("csv", "thumb,0,1,-0.01500", "thumb,0,1,nan", "'thumb' has 119"),
-    "no pitch of a lattice": ("leap", "taxel_pitch = [0.0035, 0.0035]\n", "", "either taxels"),
     "no such pad": ("leap", 'pad = "index_pad"', 'pad = "palm"', "finger 'index': pad = 'palm'"),
-    "along the pad": ("leap", "facing = [0, 0, 1]", "facing = [0, 1, 0]", "across the pad 'thumb_pad'"),
     "normal of length zero": ("csv", "-0.97944,-0.04477,0.19669", "0,0,0", ":2: the normal"),
 }
 
