@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from paths import DATA
 from random_readings import random_readings
 
 from dexsim import import_hand
@@ -74,39 +75,12 @@ def test_a_mirror_image_moves_in_the_mirror_and_mirrored_twice_is_the_hand(tmp_p
     assert is_mirror_image(image, hand) and is_mirror_image(hand, image) and not is_mirror_image(hand, hand)
 
 
-MODEL = """
-<mujoco model="right_parts">
-  <compiler meshdir="../meshes" eulerseq="zYx"/>
-  <default><default class="bent"><joint axis="0.2 1 0.3"/></default></default>
-  <asset><mesh file="right_Wedge.obj"/></asset>
-  <worldbody>
-    <light pos="1 2 3" dir="0.1 0.2 -1"/>
-    <body name="right_palm" pos="0.01 0.02 0.03" euler="20 -30 40">
-      <frame pos="0 0.01 0" axisangle="1 2 3 25">
-        <body name="Right_thumb" xyaxes="1 0.2 0 -0.1 1 0.3">
-          <joint name="a" class="bent" pos="0.001 0.002 0.003"/>
-          <inertial pos="0.01 0.02 0.03" mass="0.1" fullinertia="3e-5 4e-5 5e-5 1e-6 2e-6 -3e-6"/>
-          <geom name="wedge" type="mesh" mesh="right_Wedge" quat="0.9 0.1 0.2 -0.3" pos="0 0.02 0"/>
-          <geom type="capsule" fromto="0 0 0 0.01 0.03 0.02" size="0.01"/>
-          <body name="tip" pos="0.01 0.02 0.05">
-            <joint name="b"/>
-            <geom type="box" size="0.01 0.02 0.03" zaxis="0.3 0.4 1"/>
-            <site name="right_tip" pos="0 0.004 0.03"/>
-          </body>
-        </body>
-      </frame>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
 def test_every_way_to_write_an_mjcf_is_mirrored(tmp_path):
     """Orientations, frames, defaults and a mesh: masses, inertias and poses in C MuJoCo."""
     folder = tmp_path / "model"
     folder.mkdir()
     (tmp_path / "meshes").mkdir()
-    (folder / "right.xml").write_text(MODEL)
+    shutil.copy(DATA / "right_parts.xml", folder / "right.xml")
     (tmp_path / "meshes/right_Wedge.obj").write_text(
         "v 0 0 0\nv .03 0 0\nv 0 .02 0\nv 0 .01 .04\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )

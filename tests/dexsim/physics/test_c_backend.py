@@ -203,11 +203,10 @@ def scenes(hand):
 
 
 @pytest.fixture(scope="module")
-def grip(hand, grasp_env):
-    """(object, state) of a squeezed box."""
-    start = row(grasp_env.pool, rows_of(grasp_env.pool, "box")[0])
-    _, qpos, qvel, warmstart, torque = squeeze(hand, start, np.random.default_rng(0))
-    return start.object, PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(warmstart)), torque
+def grip(grips):
+    """(object, state, torque) of a squeezed box."""
+    start, _, *state, torque = grips[WORLDS * SHAPES.index("box")]
+    return start.object, PhysicsState(*map(jnp.asarray, state)), torque
 
 
 @pytest.mark.parametrize(("change", "compiled"), [(THIN - THICK, THIN), (-THICK, 0.0), (-0.01, 0.0)])
