@@ -1,11 +1,13 @@
 """The shipped hands: published kinematics and taxels; C MuJoCo; broken files."""
 
 import shutil
+import tomllib
 
 import jax
 import mujoco
 import numpy as np
 import pytest
+from paths import DATA
 
 from dexsim import check_hand
 from dexsim.core.assets import asset_path
@@ -13,43 +15,22 @@ from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
 
-# --- the shipped hand against published figures ------------------------------------------------
-
-# Tip positions (m) in the palm frame, computed from the published joint table.
-TIPS_AT_HALF = {  # all joints 0.5 rad, but index_bend 0.1
-    "thumb": (0.08472, 0.09962, 0.09515),
-    "index": (0.0688, 0.03544, 0.17905),
-    "middle": (0.0688, 0.004, 0.18),
-    "ring": (0.0688, -0.016, 0.177),
-    "pinky": (0.0688, -0.036, 0.174),
-}
-# name: lower, upper (rad), stall torque (Nm), no-load speed (rad/s)
-STRONG, WEAK = (1.1, 8.63), (0.4, 14.38)
-JOINTS = {
-    "thumb_bend": (0, 1.832, *STRONG),
-    "thumb_rota1": (-0.698, 1.57, *STRONG),
-    "thumb_rota2": (0, 1.57, *WEAK),
-    "index_bend": (-0.174, 0.174, *WEAK),
-}
-for finger in ("index", "mid", "ring", "pinky"):
-    JOINTS |= {f"{finger}_joint1": (0, 1.919, *STRONG), f"{finger}_joint2": (0, 1.919, *WEAK)}
-# (column, row) counted from 1 as published: position in mm, tip link frame.
-FINGER_TAXELS = {(1, 1): (0.40, -8.32, 18.09), (4, 10): (5.29, -4.03, 39.58), (8, 4): (8.34, 6.69, 25.77)}
-THUMB_TAXELS = {(1, 12): (-12.45, 41.64, -2.91), (3, 6): (-10.32, 34.98, 6.37), (9, 9): (12.51, 39.76, 0.39)}
+PUBLISHED = tomllib.loads((DATA / "published_hands.toml").read_text())
 
 
-def test_tips_are_where_the_joint_table_puts_them(hand):
-    joints = np.full(12, 0.5, np.float32)
-    joints[3] = 0.1
-    ours = jax.jit(forward_kinematics, static_argnums=0)(hand, joints).tip_position
-    np.testing.assert_allclose(ours, [TIPS_AT_HALF[name] for name in hand.finger_names], atol=1e-5)
+@pytest.mark.parametrize("entry", PUBLISHED["tips"], ids=lambda entry: entry["hand"])
+def test_tips_are_where_the_published_chains_put_them(entry):
+    hand = load_hand(entry["hand"])
+    joints = np.broadcast_to(np.float32(entry["joints"]), hand.num_joints)
+    tips = jax.jit(forward_kinematics, static_argnums=0)(hand, joints).tip_position
+    np.testing.assert_allclose(tips, [entry[name] for name in hand.finger_names], atol=entry["within"])
 
 
 def test_finger_and_joint_tables(hand):
     assert hand.finger_names == ("thumb", "index", "middle", "ring", "pinky")
-    assert hand.joint_names == tuple(JOINTS)
+    assert hand.joint_names == tuple(PUBLISHED["joints"])
     ours = np.stack([hand.joint_lower, hand.joint_upper, hand.torque_limit, hand.speed_limit], 1)
-    np.testing.assert_allclose(ours, list(JOINTS.values()), rtol=1e-6)
+    np.testing.assert_allclose(ours, list(PUBLISHED["joints"].values()), rtol=1e-6)
     roots = ["thumb_rota1", "index_joint1", "mid_joint1", "ring_joint1", "pinky_joint1"]
     assert [hand.joint_names[j] for j in hand.root_joint] == roots
     assert (hand.num_joints, hand.num_fingers, hand.num_taxels) == (12, 5, 120)
@@ -73,48 +54,16 @@ def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(hand):
         np.testing.assert_allclose(share.max(), 1.0, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("finger", "table"), [(0, THUMB_TAXELS), (4, FINGER_TAXELS)])
-def test_taxels_are_the_published_lattice(hand, finger, table):
+def test_taxels_are_the_published_lattice(hand):
     assert hand.taxel_grid == (10, 12) and hand.taxel_position.shape == (5, 120, 3)
-    for (column, row), millimetres in table.items():
-        np.testing.assert_allclose(
-            hand.taxel_position[finger, (column - 1) * 12 + row - 1] * 1e3, millimetres, atol=1e-3
-        )
-
-
-# --- the example hands ---------------------------------------------------------------------------
-
-# Tips (m, palm frame) by finger with all motors at 0 and at 0.4 rad, multiplied out from the published chains: LEAP
-# Hand of MuJoCo Menagerie (right_hand.xml; ends of its fingertip meshes), Inspire RH56 of dexsuite/dex-urdf.
-TIPS = {
-    "leap_like": {
-        "thumb": [(0.0215, 0.1387, -0.0823), (0.0897, 0.0975, -0.0246)],
-        "index": [(0.0195, 0.0080, 0.1322), (0.1100, -0.0243, 0.0786)],
-        "middle": [(0.0195, -0.0374, 0.1321), (0.1100, -0.0697, 0.0785)],
-        "ring": [(0.0195, -0.0828, 0.1321), (0.1100, -0.1151, 0.0786)],
-    },
-    "inspire_like": {
-        "thumb": [(0.0438, 0.1127, 0.1186), (0.0402, 0.0490, 0.1551)],
-        "index": [(0.0011, 0.0290, 0.2137), (0.0468, 0.0284, 0.1966)],
-        "middle": [(0.0010, 0.0069, 0.2171), (0.0489, 0.0069, 0.1991)],
-        "ring": [(0.0009, -0.0163, 0.2135), (0.0466, -0.0154, 0.1965)],
-        "pinky": [(0.0013, -0.0387, 0.2037), (0.0410, -0.0371, 0.1891)],
-    },
-}
-
-
-@pytest.mark.parametrize("name", TIPS)
-def test_tips_are_where_the_published_chains_put_them(name):
-    hand = load_hand(name)
-    kinematics = jax.jit(lambda joints: forward_kinematics(hand, joints).tip_position)
-    for row, angle in enumerate((0.0, 0.4)):
-        tips = kinematics(np.full(hand.num_joints, angle, np.float32))
-        wanted = [TIPS[name][finger][row] for finger in hand.finger_names]
-        np.testing.assert_allclose(tips, wanted, atol=6e-4)  # places are rounded to 0.1 mm
+    for name, taxels in PUBLISHED["taxels"].items():
+        for column, row, *millimetres in taxels:
+            place = hand.taxel_position[hand.finger_names.index(name), (column - 1) * 12 + row - 1]
+            np.testing.assert_allclose(1e3 * place, millimetres, atol=1e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TIPS)
+@pytest.mark.parametrize("name", ["leap_like", "inspire_like"])
 def test_passes_the_checks(name, capsys):
     assert check_hand.main([name]) == 0
     out = capsys.readouterr().out
