@@ -30,11 +30,6 @@ def turned(part):
     return part
 
 
-def flat(part):
-    part.apply_scale([1, 1, 1e-9])
-    return part
-
-
 def bad_meshes():
     box = trimesh.creation.box(2 * BOX)
     vertices, faces = np.array(box.vertices), np.array(box.faces)
@@ -46,7 +41,7 @@ def bad_meshes():
         "non-manifold: 1 edges have more than two": touching,
         "inward": turned(box.copy()),
         "both ways": (vertices, mixed),
-        "no volume": flat(box.copy()),
+        "no volume": box.copy().apply_scale([1, 1, 1e-9]),
         "scale=0.001": (1000 * vertices, faces),
         "6e-05 m across": (1e-3 * vertices, faces),
         "nowhere.stl": "nowhere.stl",

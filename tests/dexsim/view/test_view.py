@@ -171,16 +171,10 @@ sys.argv = ["dexsim"]
 """
 
 
-def python_without_jax(code):
-    done = subprocess.run([sys.executable, "-c", WITHOUT_JAX + code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
 def test_the_demo_shows_recorded_episodes_without_jax():
     """Each episode to its end, in a scene on viser's server, as the page gets it."""
     recorded = sorted(path.stem for path in asset_path("episodes").glob("*.npz"))
-    said = python_without_jax(f"""
+    code = f"""
 import itertools
 from dexsim.view import __main__ as demo, viewer
 class Page(viewer.Viewer):
@@ -196,8 +190,10 @@ class Page(viewer.Viewer):
 viewer.Viewer = Page
 for name in {recorded}:
     demo.main([name, "--port", "18090"])
-""")
-    shown = [line.split() for line in said if line.startswith(("grasp ", "rotate "))]
+"""
+    done = subprocess.run([sys.executable, "-c", WITHOUT_JAX + code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    shown = [line.split() for line in done.stdout.splitlines() if line.startswith(("grasp ", "rotate "))]
     assert len(shown) == len(recorded) >= 3
     for camera, frames, touching, jax in shown:
         assert camera in ("grasp", "rotate") and int(frames) > 200 and (touching, jax) == ("True", "None")
