@@ -47,9 +47,8 @@ _pose = jax.jit(forward_kinematics, static_argnums=0)
 def check_kinematics(hand: Hand) -> str:
     """Link poses against C MuJoCo at random joint angles."""
     angles = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (_POSES, hand.num_joints))
-    poses = jax.jit(jax.vmap(lambda joints: forward_kinematics(hand, joints)))(angles.astype(np.float32))
-    for drawn, *found in zip(hand_poses(hand, angles), poses.body_position, poses.body_rotation, strict=True):
-        position, rotation = map(np.asarray, found)
+    pose = jax.device_get(jax.jit(jax.vmap(lambda joints: forward_kinematics(hand, joints)))(np.float32(angles)))
+    for drawn, position, rotation in zip(hand_poses(hand, angles), pose.body_position, pose.body_rotation, strict=True):
         away = np.linalg.norm(position - drawn.body_position, axis=-1)
         turned = np.linalg.norm(rotation - drawn.body_rotation, axis=(-2, -1)) / np.sqrt(2)  # small angles
         for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):

@@ -66,10 +66,10 @@ def test_an_episodes_imu_is_as_wide_as_the_ranges_and_the_curriculum_together(ha
         task, keys = Rotate(config, hand), jax.random.split(jax.random.key(1), 3)
         taxels = SensorSuite(config, hand, task).taxels
 
-        def draw(scale):
+        def draw(keys, scale):
             return sample_episode(task, hand, taxels, keys, task.sample_object(keys[0], config), scale).imu
 
-        return jax.jit(draw)(jnp.float32(curriculum))
+        return jax.jit(draw)(tuple(keys), jnp.float32(curriculum))
 
     full, part = drawn(1.0, 1.0), drawn(0.5, 0.3)
     for name in ("bias", "drift", "delay"):
