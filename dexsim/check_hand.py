@@ -41,14 +41,14 @@ _REACH = 0.06  # m, from the object's centre to the nearest fingertip
 _BALL, _OVERLAP = 0.022, 0.002  # m, radius of the smallest sphere of the default objects; depth that start states allow
 _UPRIGHT = 0.5  # share of an open finger's length along +z
 _SIDEWAYS = 0.01  # m, how far a thumb must be to a side for it to have one
+_pose = jax.jit(forward_kinematics, static_argnums=0)
 
 
 def check_kinematics(hand: Hand) -> str:
     """Link poses against C MuJoCo at random joint angles."""
     angles = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (_POSES, hand.num_joints))
-    poses = jax.vmap(lambda joints: forward_kinematics(hand, joints))(angles.astype(np.float32))
-    positions, rotations = np.asarray(poses.body_position), np.asarray(poses.body_rotation)
-    for drawn, position, rotation in zip(hand_poses(hand, angles), positions, rotations, strict=True):
+    pose = jax.device_get(jax.jit(jax.vmap(lambda joints: forward_kinematics(hand, joints)))(np.float32(angles)))
+    for drawn, position, rotation in zip(hand_poses(hand, angles), pose.body_position, pose.body_rotation, strict=True):
         away = np.linalg.norm(position - drawn.body_position, axis=-1)
         turned = np.linalg.norm(rotation - drawn.body_rotation, axis=(-2, -1)) / np.sqrt(2)  # small angles
         for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):
@@ -92,7 +92,7 @@ def check_taxels(hand: Hand) -> str:
 def check_frame(hand: Hand) -> str:
     """With the joints at 0, fingers point along +z, and the thumb is on the side of +y, of a left hand on that of
     -y."""
-    pose = forward_kinematics(hand, open_hand(hand))
+    pose = _pose(hand, open_hand(hand))
     tips, bodies = np.asarray(pose.tip_position), np.asarray(pose.body_position)
     roots = np.array([bodies[finger_bodies(hand, finger)[-2]] for finger in range(hand.num_fingers)])
     ways = (tips - roots) / np.linalg.norm(tips - roots, axis=1, keepdims=True)
@@ -114,7 +114,7 @@ def check_signs(hand: Hand) -> str:
     motion = jax.jit(jax.jacfwd(lambda joints: forward_kinematics(hand, joints).tip_position))
     jacobian, way = np.array(motion(opened)), np.tile([1.0, 0.0, 0.0], (hand.num_fingers, 1))
     jacobian[0] = motion(grasp)[0]
-    way[0] = np.asarray(forward_kinematics(hand, grasp).tip_rotation[0]) @ hand.taxel_normal[0].mean(0)
+    way[0] = np.asarray(_pose(hand, grasp).tip_rotation[0]) @ hand.taxel_normal[0].mean(0)
     for finger in range(hand.num_fingers):
         for joint in flexion_joints(hand, range(finger, finger + 1)):
             step = jacobian[finger, :, joint]
@@ -128,13 +128,13 @@ def check_reach(hand: Hand) -> str:
     if not hand.grasp_posture or not hand.grasp_centre:
         return f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre"
     posture, centre = np.asarray(hand.grasp_posture, np.float32), np.asarray(hand.grasp_centre)
-    tips = np.asarray(forward_kinematics(hand, posture).tip_position)
+    tips = np.asarray(_pose(hand, posture).tip_position)
     away = 1e3 * np.linalg.norm(tips - centre, axis=-1).min()
     if away > 1e3 * _REACH:
         return f"[grasp]: the fingertip nearest to centre is {away:.0f} mm away, expected {1e3 * _REACH:.0f} mm at most"
     centre[0] = palm_height(hand) + 0.005 + _BALL
     ball = sdf.Shape(("sphere",), jnp.full((1, 3), _BALL), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.ones(1, bool))
-    gap = float(clearance(hand, jnp.asarray(posture), ball, jnp.asarray(centre), jnp.eye(3)))
+    gap = float(jax.jit(clearance, static_argnums=0)(hand, posture, ball, centre, np.eye(3, dtype=np.float32)))
     deep = f"{-1e3 * gap:.0f} mm deep in a ball of {2e3 * _BALL:.0f} mm at centre"
     return f"[grasp]: a link is {deep}: open the posture or move centre" if gap < -_OVERLAP else ""
 

@@ -117,7 +117,6 @@ WRONG = {
     ),
     "no grasp": ({r"(?s)\[grasp\].*?(?=\[\[)": ""}, check_hand.check_reach, "'leap_like' has no grasp: its TOML needs"),
     "stretched": ({r"posture = \[.*\]": f"posture = {[0.0] * 16}"}, check_hand.check_reach, FAR),
-    "behind": ({r"centre = \[.*\]": "centre = [0, 0, -0.30]"}, check_hand.check_reach, FAR),
     "closed": (
         {r"posture = \[.*\]": f"posture = {CLOSED}"},
         check_hand.check_reach,

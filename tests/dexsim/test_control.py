@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.control import Control, ForceLoop, commanded_force, correct_command, move_target, observed_action
+from dexsim.control import Control, ForceLoop, correct_command, move_target, observed_action
 from dexsim.core.errors import ConfigError
 from dexsim.touch.reduce import ForceEstimate, estimate_force
 
@@ -76,13 +76,6 @@ def test_the_correction_of_a_weak_grip_follows_its_differential_equation():
 def test_it_waits_for_two_fingers_beside_the_thumb(force, moves):
     after = correct(LOOP, SPAN, PERIOD, jnp.asarray(1.0), jnp.asarray(0.2), fingers(*force))
     assert float(after) == pytest.approx(0.2 + moves * 0.5 * (1 - (3 - 2) / 5) * PERIOD)
-
-
-def test_a_command_speaks_of_the_mean_over_touching_fingers_without_the_thumb():
-    force = fingers(9.0, 4.0, 0.5, 2.0, 0.0)
-    touching = jnp.array([True, True, False, True, False])
-    assert float(commanded_force(force, touching)) == pytest.approx(3.0)
-    assert float(commanded_force(force, jnp.zeros(5, bool))) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -47,21 +47,16 @@ def truth(hand, readings):
     mujoco.mju_mulQuat(relative, readings.goal_quat.astype(float), back)
     mujoco.mju_quat2Mat(matrix, relative)
     matrix = matrix.reshape(3, 3)
-    return {
-        "joint_position": readings.joint_position,
-        "joint_torque": readings.joint_torque,
-        "object_position": readings.object_position,
-        "object_velocity": readings.object_velocity,
+    same = "joint_position", "joint_torque", "object_position", "object_velocity", "last_action", "palm_gravity"
+    return {name: getattr(readings, name) for name in same} | {
         "contact_force": readings.taxel_force.sum(1),
         "contact_centre": np.ravel(centre),
         "fingertip_position": np.ravel(tip),
         "command": [0.37],
-        "last_action": readings.last_action,
         "relative_orientation": np.concatenate([matrix[:, 0], matrix[:, 1]]),
         "relative_quaternion": relative,
         "plain_centre": np.ravel(plain),
         "past_actions": np.ravel(readings.past_actions),
-        "palm_gravity": readings.palm_gravity,
     }
 
 

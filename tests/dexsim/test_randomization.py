@@ -24,20 +24,15 @@ def draws(hand, config):
 def quantities(hand, drawn):
     """Each drawn quantity as the config names its range, one row per draw."""
     motors = drawn.actuator
-    return {
+    same = "dead_band", "efficiency", "ripple", "ripple_count", "viscous_friction", "encoder_bias"
+    return {name: getattr(motors, name) for name in same} | {
         "stiffness_factor": motors.stiffness / 3.0,
         "damping_factor": motors.damping / 0.1,
-        "dead_band": motors.dead_band,
         "torque_factor": motors.stall_torque / hand.torque_limit,
         "speed_factor": motors.no_load_speed / hand.speed_limit,
-        "efficiency": motors.efficiency,
-        "ripple": motors.ripple,
-        "ripple_count": motors.ripple_count,
         "coulomb_friction": motors.coulomb_friction / hand.torque_limit,
-        "viscous_friction": motors.viscous_friction,
         "latency": drawn.latency[:, :1] * TIMES["timestep"],
         "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
-        "encoder_bias": drawn.actuator.encoder_bias,
         "torque_gain": drawn.torque_gain,
         "taxel_gain": drawn.taxel_gain[..., 0],
         "gravity_tilt": drawn.tilt,
@@ -135,9 +130,7 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
     ("values", "word"),
     [
         ({"efficiency": (1.0, 0.8)}, "efficiency"),
-        ({"latency": (-0.1, 0.01)}, "latency"),
         ({"scale": 3.0, "torque_factor": (0.5, 1.0)}, "torque_factor"),  # 1 - 1.5: a negative torque
-        ({"scale": 3.0, "gravity_tilt": 0.6}, "gravity_tilt"),
         ({"beyond": 0.2}, "extremes"),
     ],
 )
@@ -177,7 +170,7 @@ def leaf_name(path):
 
 
 def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
-    """Where every world has its neighbour's value, something differs after nine ticks."""
+    """Where a world has its neighbour's value, something differs after nine ticks."""
     states = grasp_rollout.reset(jax.random.key(21))
     actions = np.random.default_rng(4).uniform(-0.5, 1.5, (9, *states.joint_target.shape)).astype(np.float32)
 
@@ -190,12 +183,19 @@ def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
 
     plain = run(states.episode)
 
-    def shows(path):
-        """What differs with another value there: "motion", or names of readings."""
-        swap = lambda place, leaf: jnp.roll(leaf, 1, 0) if leaf_name(place) == path else leaf  # noqa: E731
+    def show(*paths):
+        """What differs with other values there, one in each fourth world: "motion", or names of readings."""
+        world = np.arange(len(actions[0])) % 4
+
+        def swap(place, leaf):
+            own = np.array([*paths, *[""] * 4])[world] == leaf_name(place)
+            return jnp.where(own.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.roll(leaf, 1, 0), leaf)
+
         found = run(jax.tree_util.tree_map_with_path(swap, states.episode))
-        changed = [np.abs(a - b).max() > 1e-6 for a, b in zip(plain, found, strict=True)]
-        return [name for name, moved in zip(("motion", *READINGS), changed, strict=True) if moved]
+        apart = [np.abs(a - b).max(axis=(0, *range(2, a.ndim))) > 1e-6 for a, b in zip(plain, found, strict=True)]
+        for k, path in enumerate(paths):
+            changed = zip(("motion", *READINGS), (np.any(moved[world == k]) for moved in apart), strict=True)
+            yield path, [name for name, moved in changed if moved]
 
     drawn = {leaf_name(path) for path, x in jax.tree_util.tree_leaves_with_path(states.episode) if np.any(x != x[:1])}
     # What belongs to a size, the phase of an IMU that is as fast as the control, and one of taxels, which shows late.
@@ -203,7 +203,6 @@ def test_every_value_that_is_drawn_reaches_motion_or_readings(grasp_rollout):
     assert drawn - silent == {*MOVING, *SENSED}
     contact = np.asarray(states.episode.object.contact)
     assert np.ptp(contact, axis=0).min() > 0, "stiffness or damping of the contact is not drawn"
-    for path in MOVING:
-        assert "motion" in shows(path), path
-    for path, reading in SENSED.items():
-        assert reading in (moved := shows(path)) and "motion" not in moved, path
+    names = [*MOVING, *SENSED]
+    for path, found in (each for k in range(0, len(names), 4) for each in show(*names[k : k + 4])):
+        assert SENSED.get(path, "motion") in found and ("motion" in found) == (path in MOVING), path

@@ -36,27 +36,18 @@ def test_a_registered_task_is_made_by_name_with_its_annotated_configuration(hand
     assert registry.find_task("mine").config_class is GraspConfig
 
 
-ODD = {
-    "nothing of a task": (object(), "object: expected a subclass of dexsim.Task"),
-    "one group": ({"fields": {"actor": ("command",)}}, "'mine': fields\\['critic'\\] is missing or empty"),
-    "an unknown field": (
-        {"fields": {"actor": ("command", "smell"), "critic": ("command",)}},
-        "'mine': no observation field 'smell': choose from joint_position, ",
-    ),
-}
+ODD = [
+    ({"actor": ("command",)}, "'mine': fields\\['critic'\\] is missing or empty"),
+    ({"actor": ("command", "smell"), "critic": ("command",)}, "'mine': no observation field 'smell': choose from"),
+]
 
 
-@pytest.mark.parametrize("what", ODD)
-def test_what_a_task_lacks_is_named(hand, what):
-    change, message = ODD[what]
-    dexsim.register("mine", lambda config, hand: made, config=GraspConfig)
-    made = change
-    if isinstance(change, dict):
-        made = Mine(GraspConfig(), hand)
-        vars(made).update(change)
-    with pytest.raises(ConfigError, match=message) as error:
+@pytest.mark.parametrize(("fields", "message"), ODD)
+def test_what_a_task_lacks_is_named(hand, monkeypatch, fields, message):
+    monkeypatch.setattr(Mine, "fields", fields)
+    dexsim.register("mine", Mine)
+    with pytest.raises(ConfigError, match=message):
         registry.make_task("mine", hand)
-    assert "\n" not in str(error.value)
 
 
 def test_a_module_is_named_with_the_task(tmp_path, monkeypatch):

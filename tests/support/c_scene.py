@@ -132,6 +132,15 @@ def start(model: mujoco.MjModel, qpos, qvel, warmstart=None) -> mujoco.MjData:
     return data
 
 
+def step(hand, target, begun, torque, exact):
+    """One step of the converged scene from (qpos, qvel, warm start) under joint torques: data, finger forces [F, 3]."""
+    model = compile_scene(hand, target, exact=exact, **CONVERGED)
+    data = start(model, *begun)
+    data.qfrc_applied[:12] = torque
+    mujoco.mj_step(model, data)
+    return data, finger_force(model, data, hand)
+
+
 def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray:
     """Force of the object on each tip link [F, 3] N, world axes."""
     tips = [model.body(hand.body_names[body]).id for body in hand.tip_body]

@@ -2,7 +2,6 @@
 
 import copy
 import types
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -16,9 +15,7 @@ States = dict[str, np.ndarray]
 """By name, float32 [N, size]: qpos, qvel, warmstart, push, targets of the joints, and the fields of the object."""
 
 
-def scene_of_model(
-    model: mujoco.MjModel, slots: tuple[str, ...], driven: np.ndarray, tips: np.ndarray, tip_geoms: np.ndarray
-) -> PhysicsScene:
+def scene_of_model(model, slots, driven, tips, tip_geoms) -> PhysicsScene:
     """The scene of a hand of hinges, of which joints `driven` have motors, and of an object whose body is "object" and
     whose geoms are "object_0" and on, one for each of the slots."""
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
@@ -71,9 +68,7 @@ def private_model(scene: PhysicsScene) -> mujoco.MjModel:
     return model
 
 
-def tumble(
-    scene: PhysicsScene, count: int, start: Callable[[np.random.Generator], np.ndarray], seed: int = 0
-) -> States:
+def tumble(scene: PhysicsScene, count: int, start, seed: int = 0) -> States:
     """States while joints move at random and an object falls on the hand from the pose [7] that `start` draws."""
     model, random = private_model(scene), np.random.default_rng(seed)
     data, body, joints = mujoco.MjData(model), scene.object_body, len(scene.joint_dof)
@@ -113,9 +108,8 @@ def mujoco_substeps(scene: PhysicsScene, states: States, substeps: int) -> dict[
         data.qpos[:], data.qvel[:] = states["qpos"][row], states["qvel"][row]
         acceleration, contacts = states["warmstart"][row].astype(float), 0
         for substep in range(substeps):
-            acceleration = _substep(
-                scene, model, data, states["target"][row].astype(float), states["push"][row], acceleration
-            )
+            target = states["target"][row].astype(float)
+            acceleration = _substep(scene, model, data, target, states["push"][row], acceleration)
             if substep == 0:
                 contacts = sum(contact.dist < 0 for contact in data.contact[: data.ncon])
         force = force_on(model, data, scene.tip_bodies, scene.object_body)
@@ -124,14 +118,7 @@ def mujoco_substeps(scene: PhysicsScene, states: States, substeps: int) -> dict[
     return {name: np.array(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _substep(
-    scene: PhysicsScene,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    target: np.ndarray,
-    push: np.ndarray,
-    guess: np.ndarray,
-) -> np.ndarray:
+def _substep(scene, model, data, target, push, guess):
     """One step. Returns the acceleration [V]."""
     data.qfrc_applied[scene.joint_dof] = pd_torque(target, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
     data.xfrc_applied[scene.object_body, :3] = push

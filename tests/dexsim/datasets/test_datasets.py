@@ -152,12 +152,8 @@ def test_episodes_are_read_back_as_they_were_written(tmp_path):
     written = read_episodes(asset_path("episodes") / "rotate.npz")
     write_episodes(tmp_path / "a.npz", written)
     found = read_episodes(tmp_path / "a.npz")
-    assert (found.task, found.hand.name, found.period, found.kinds) == (
-        "rotate",
-        "xhand_right",
-        written.period,
-        ("box",),
-    )
+    expected = "rotate", "xhand_right", written.period, ("box",)
+    assert (found.task, found.hand.name, found.period, found.kinds) == expected
     assert len(found.snapshots) == len(written.snapshots) > 1
     for now, before in zip(found.snapshots, written.snapshots, strict=True):
         for field in dataclasses.fields(Snapshot):

@@ -13,6 +13,7 @@ from c_scene import skin_law
 from episodes import by_field, with_episode
 
 from dexsim import observation
+from dexsim.actuator.drive import delayed_target
 from dexsim.env.motors import JointCommand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
@@ -88,6 +89,13 @@ class TestTick:
             state.key, state.episode.object
         )
 
+        # Torque readings: what the motors give at the end of the tick, over the stall torque.
+        position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
+        torque = plain_drive(
+            c_scene.row(after.episode.hand.actuator, slice(None)), np.asarray(after.joint_target), position, velocity
+        )
+        np.testing.assert_allclose(np.asarray(after.joint_torque) * hand.torque_limit, torque, atol=2e-5)
+
         strong, close = 0, []
         cover = c_scene.COVER + np.asarray(state.episode.hand.pad_thickness_delta)
         skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.episode.object, cover))
@@ -133,19 +141,12 @@ class TestTick:
         assert np.mean(close) > 0.6
 
     def test_a_latency_of_more_than_a_tick_is_that_of_the_tick_before(self, grasp_env):
-        """Of three sub-steps: sub-steps within the tick, and the targets before and after them."""
+        """The targets that act in three sub-steps: the mean of two where the latency ends within one."""
         one, latency = jnp.ones(3), jnp.array([0.5, 3.0, 4.5])
         command = JointCommand(0 * one, target=3 * one, previous=2 * one, valid=one > 0, earlier=one)
-        found = grasp_env.motors._delay(SimpleNamespace(latency=latency), command)
-        np.testing.assert_allclose(found, [[0.5, 3.0, 1.5], [2, 2, 1], [3, 3, 2]])
-
-    def test_torque_readings_are_the_drives(self, hand, history):
-        """The torque that the motors would give at the end of the tick, over the stall torque."""
-        _, _, after = history[5]
-        drive = c_scene.row(after.episode.hand.actuator, slice(None))
-        position, velocity = (np.asarray(x[:, :12], float) for x in (after.physics.qpos, after.physics.qvel))
-        torque = plain_drive(drive, np.asarray(after.joint_target), position, velocity)
-        np.testing.assert_allclose(np.asarray(after.joint_torque) * hand.torque_limit, torque, atol=2e-5)
+        delay = grasp_env.motors._delay(SimpleNamespace(latency=latency), command)
+        acting = [delayed_target(jnp.int32(substep), *delay) for substep in range(3)]
+        np.testing.assert_allclose(acting, [[2.5, 2, 1], [3, 2, 1.5], [3, 2, 2]])
 
     def test_actions_are_clipped(self, grasp_rollout, history):
         state, _, _ = history[4]
@@ -261,7 +262,7 @@ class TestEpisodes:
         state = dataclasses.replace(
             state,
             physics=dataclasses.replace(state.physics, qpos=aside, qvel=moving),
-            goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1)),
+            goal=dataclasses.replace(state.goal, delay=jnp.full(WORLDS, 0.1, jnp.float32)),
         )
         heights, still = [], state.key
         for _ in range(7):  # the same chance in every tick: one without a push
@@ -298,6 +299,7 @@ def test_a_world_that_blows_up(grasp_rollout, history):
     assert np.all(after.metrics["non_finite"][bad[1:3]] == 1)
     assert_same(after, following, good)
     assert not np.any(after.metrics["non_finite"][good])
+    assert_same(grasp_rollout.step(state, action), following)  # nothing of it is left in the engine
     assert np.all(np.abs(after.reward) < 100)
     for name in ("reward", "obs", "metrics", "physics", "episode_return"):
         for path, value in leaves(getattr(after, name)).items():

@@ -81,22 +81,11 @@ class SimpleObject:
     shape_index: np.ndarray
 
 
-def plan_of(count, seed):
-    return Evaluation(SimpleNamespace(name="rows", task=Rows())).evaluation_plan(count, seed)
-
-
-def test_no_start_is_trainings_and_no_seed_has_anothers():
-    plans = [plan_of(8, seed).start.qpos for seed in (0, 1, 2**32 - 1)]
-    pools = [distinct(qpos) for qpos in (Rows().make_pool(jax.random.key(0)).qpos, *plans)]
-    assert [len(pool) for pool in pools] == [8] * 4 and len(set.union(*pools)) == 32
-
-
-@pytest.mark.parametrize("count", [1, 8, 30])
-def test_no_start_repeats_however_many_episodes(count):
-    plan = plan_of(count, 0)
-    assert len(distinct(plan.start.qpos)) == len(np.unique(plan.row)) == count
-    assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
-
-
-def distinct(qpos):
-    return {tuple(row) for row in np.asarray(qpos)}
+def test_no_start_is_trainings_and_none_repeats():
+    """However many episodes, and whatever their seeds."""
+    seen = [Rows().make_pool(jax.random.key(0)).qpos]
+    for count, seed in ((1, 2), (8, 2**32 - 1), (30, 0), (8, 1)):
+        plan = Evaluation(SimpleNamespace(name="rows", task=Rows())).evaluation_plan(count, seed)
+        assert len(np.unique(plan.row)) == len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
+        seen.append(plan.start.qpos)
+    assert len(np.unique(np.concatenate(seen), axis=0)) == 8 + 1 + 8 + 30 + 8

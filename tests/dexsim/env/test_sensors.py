@@ -118,16 +118,6 @@ def test_angles_come_in_steps_and_each_reading_has_its_own_noise(hand, read):
     assert place.std() == pytest.approx(0.03, rel=0.25)
 
 
-def test_past_actions_are_the_two_before_the_last(hand, read):
-    now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1))
-    last, shown = None, []
-    for _ in range(4):
-        reading = read(QUIET, now, last)
-        shown.append(np.asarray(reading.past_actions)[:, 0])
-        last = dataclasses.replace(reading, last_action=jnp.full(12, len(shown) / 10)), now
-    np.testing.assert_allclose(shown, [[0.5, 0.5], [0.1, 0.5], [0.2, 0.1], [0.3, 0.2]], rtol=1e-5)
-
-
 def test_gravity_in_the_palm_frame_has_the_mounts_lean_and_the_alignments_error(hand, read):
     """The grasp's palm faces down (gravity +x); a pitch of 0.1 rad is about y. A wrong alignment turns it too."""
     now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1))

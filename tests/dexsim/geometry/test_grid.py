@@ -1,4 +1,4 @@
-"""Meshes against closed forms and brute force; baked grids against exact distances; what is refused, and why."""
+"""Meshes against closed forms; baked grids against SciPy's interpolation; what is refused, and why."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.interpolate import RegularGridInterpolator
-from shapes import bake, bounds, solid
+from shapes import bake, solid
 
 from dexsim.core.errors import AssetError
 from dexsim.geometry import grid, mesh
@@ -17,7 +17,7 @@ from dexsim.geometry.distance import distance_and_normal as measure
 BOX = np.array([0.025, 0.02, 0.03])
 COARSE = 24  # nodes
 signed_distance = jax.jit(grid.signed_distance)
-distance_and_normal = exact = jax.jit(measure)
+distance_and_normal = jax.jit(measure)
 
 
 @pytest.fixture(autouse=True)
@@ -25,30 +25,15 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path / "cache"))
 
 
-def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
-    """Points [P, 3] within `low` to `high` of the surface, with exact distance and normal."""
-    box = bounds(shape)
-    points = np.random.default_rng(seed).uniform(box[0] - high, box[1] + high, (10 * count, 3)).astype(np.float32)
-    value, normal = (np.asarray(x) for x in exact(points, shape))
-    keep = np.flatnonzero((value > low) & (value < high))[:count]
-    return points[keep], value[keep], normal[keep]
-
-
 def turned(part):
     part.invert()
-    return part
-
-
-def flat(part):
-    part.apply_scale([1, 1, 1e-9])
     return part
 
 
 def bad_meshes():
     box = trimesh.creation.box(2 * BOX)
     vertices, faces = np.array(box.vertices), np.array(box.faces)
-    nan, mixed = vertices.copy(), faces.copy()
-    nan[3, 1] = np.nan
+    mixed = faces.copy()
     mixed[4] = mixed[4][::-1]
     touching = trimesh.util.concatenate([box, box.copy().apply_translation(2 * BOX * [1, 1, 0])])
     return {
@@ -56,11 +41,9 @@ def bad_meshes():
         "non-manifold: 1 edges have more than two": touching,
         "inward": turned(box.copy()),
         "both ways": (vertices, mixed),
-        "no volume": flat(box.copy()),
-        "not finite": (nan, faces),
+        "no volume": box.copy().apply_scale([1, 1, 1e-9]),
         "scale=0.001": (1000 * vertices, faces),
         "6e-05 m across": (1e-3 * vertices, faces),
-        "no triangles": (vertices, faces[:0]),
         "nowhere.stl": "nowhere.stl",
     }
 
@@ -97,20 +80,6 @@ def test_a_hollow_ball_is_signed_right():
     mesh.check_sign(hollow)
     value = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
     np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
-
-
-SMOOTH = {"sphere": (0.03,), "capsule": (0.013, 0.025)}
-
-
-@pytest.mark.parametrize("kind", SMOOTH)
-def test_64_nodes_are_within_ten_micrometres_on_smooth_shapes(kind):
-    shape = solid(kind, *SMOOTH[kind])
-    points, value, normal = shell(shape)
-    ours, ours_normal = distance_and_normal(points, bake(shape))
-    error = np.abs(np.asarray(ours) - value)
-    assert error.mean() <= 10e-6 and error.max() < 40e-6
-    assert np.mean((np.asarray(ours) < 0) != (value < 0)) < 0.004
-    assert np.degrees(np.arccos(np.clip(np.sum(ours_normal * normal, -1), -1, 1))).mean() < 1.0
 
 
 def test_values_are_scipys_interpolation():

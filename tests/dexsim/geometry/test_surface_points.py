@@ -29,17 +29,14 @@ def test_the_search_finds_the_nearest():
         jnp.tile(jnp.eye(3), (3, 1, 1)),
         jnp.array([True, True, False]),
     )
-    surface = surface_points.from_shape(shape, FEW)
+    surface = jax.jit(surface_points.from_shape, static_argnums=1)(shape, FEW)
     points = probes(shape)
     real = np.asarray(surface.position)
     gap, wanted = cKDTree(real.astype(float)).query(points.astype(float), k=2)
     found = np.asarray(nearest(points, surface))
     ours = np.linalg.norm(points - real[found], axis=1)
-    near = gap[:, 0] < 0.006
-    assert near.sum() > 300
-    np.testing.assert_allclose(ours[near], gap[near, 0], atol=1e-6)
     np.testing.assert_allclose(ours, gap[:, 0], atol=1e-6)
-    sure = near & (gap[:, 1] - gap[:, 0] > 1e-6)
+    sure = gap[:, 1] - gap[:, 0] > 1e-6
     np.testing.assert_array_equal(found[sure], wanted[sure, 0])
 
 

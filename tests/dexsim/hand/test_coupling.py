@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from paths import DATA
 from two_fingers import write
 
 from dexsim.core.errors import AssetError
@@ -16,39 +17,7 @@ from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
 
-# References, an anchor beside the body's origin, and a ratio and an offset of their own.
-MJCF = """
-<mujoco>
-  <compiler angle="radian"/>
-  <default><joint type="hinge" damping="0.01" armature="0.0005" actuatorfrcrange="-.5 .5"/></default>
-  <worldbody>
-    <body name="base"><geom name="base" type="box" size=".02 .04 .05" mass=".2"/>
-      <body name="a1" pos=".03 .02 .05">
-        <joint name="a" axis="0 1 0" range="-0.5 1.2"/>
-        <geom name="a1" type="capsule" fromto="0 0 0 0 0 .04" size=".006" mass=".02"/>
-        <body name="a2" pos="0 0 .04">
-          <joint name="a_next" axis="0 1 .2" pos="0 .001 .002" range="-1 3" ref="0.2"/>
-          <geom name="a2" type="capsule" fromto="0 0 .005 0 0 .03" size=".006" mass=".02"/>
-          <site name="a_tip" pos="0 0 .04"/>
-        </body>
-      </body>
-      <body name="b1" pos=".03 -.02 .05">
-        <joint name="b" axis="0 1 0" range="-0.5 1.2" ref="-0.1"/>
-        <geom name="b1" type="capsule" fromto="0 0 0 0 0 .04" size=".006" mass=".02"/>
-        <body name="b2" pos="0 0 .04">
-          <joint name="b_next" axis="0 1 0" range="-2 2"/>
-          <geom name="b2" type="capsule" fromto="0 0 .005 0 0 .03" size=".006" mass=".02"/>
-          <site name="b_tip" pos="0 0 .04"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <equality>
-    <joint name="couple_a" joint1="a_next" joint2="a" polycoef="0.05 1.3 0 0 0"/>
-    <joint name="couple_b" joint1="b_next" joint2="b" polycoef="-0.1 0.7 0 0 0"/>
-  </equality>
-</mujoco>
-"""
+MJCF = (DATA / "coupled.xml").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -114,11 +83,6 @@ REFUSED = {
     "chain": (COUPLE_A, COUPLE_A.replace('joint2="a"', 'joint2="b_next"'), "follows 'b_next'.*no motor"),
     "beyond its range": ('range="-2 2"', 'range="-2 0.5"', "'b_next' has the range -2 to 0.5 rad.*to 0.81"),
     "none": (COUPLE_A, "", "lists 2 of the 3 joints"),
-    "tendon": (
-        "<equality>",
-        '<tendon><fixed name="string"><joint joint="a" coef="1"/></fixed></tendon><equality>',
-        "tendon 'string'",
-    ),
 }
 
 

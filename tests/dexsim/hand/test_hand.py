@@ -1,11 +1,13 @@
 """The shipped hands: published kinematics and taxels; C MuJoCo; broken files."""
 
 import shutil
+import tomllib
 
 import jax
 import mujoco
 import numpy as np
 import pytest
+from paths import DATA
 
 from dexsim import check_hand
 from dexsim.core.assets import asset_path
@@ -13,69 +15,24 @@ from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
 from dexsim.hand.load import load_hand
 
-# --- the shipped hand against published figures ------------------------------------------------
-
-# Tip positions (m) in the palm frame, computed from the published joint table.
-TIPS_AT_ZERO = {
-    "thumb": (0.02211, 0.15684, 0.02872),
-    "index": (0.0065, 0.0265, 0.20575),
-    "middle": (0.0065, 0.004, 0.20625),
-    "ring": (0.0065, -0.016, 0.20325),
-    "pinky": (0.0065, -0.036, 0.20025),
-}
-TIPS_AT_HALF = {  # all joints 0.5 rad, but index_bend 0.1
-    "thumb": (0.08472, 0.09962, 0.09515),
-    "index": (0.0688, 0.03544, 0.17905),
-    "middle": (0.0688, 0.004, 0.18),
-    "ring": (0.0688, -0.016, 0.177),
-    "pinky": (0.0688, -0.036, 0.174),
-}
-# id: name, lower, upper (rad), stall torque (Nm), no-load speed (rad/s)
-JOINTS = (
-    ("thumb_bend", 0, 1.832, 1.1, 8.63),
-    ("thumb_rota1", -0.698, 1.57, 1.1, 8.63),
-    ("thumb_rota2", 0, 1.57, 0.4, 14.38),
-    ("index_bend", -0.174, 0.174, 0.4, 14.38),
-    ("index_joint1", 0, 1.919, 1.1, 8.63),
-    ("index_joint2", 0, 1.919, 0.4, 14.38),
-    ("mid_joint1", 0, 1.919, 1.1, 8.63),
-    ("mid_joint2", 0, 1.919, 0.4, 14.38),
-    ("ring_joint1", 0, 1.919, 1.1, 8.63),
-    ("ring_joint2", 0, 1.919, 0.4, 14.38),
-    ("pinky_joint1", 0, 1.919, 1.1, 8.63),
-    ("pinky_joint2", 0, 1.919, 0.4, 14.38),
-)
-# (column, row) counted from 1 as published: position in mm, tip link frame.
-FINGER_TAXELS = {(1, 1): (0.40, -8.32, 18.09), (4, 10): (5.29, -4.03, 39.58), (8, 4): (8.34, 6.69, 25.77)}
-THUMB_TAXELS = {(1, 12): (-12.45, 41.64, -2.91), (3, 6): (-10.32, 34.98, 6.37), (9, 9): (12.51, 39.76, 0.39)}
+PUBLISHED = tomllib.loads((DATA / "published_hands.toml").read_text())
 
 
-@pytest.fixture(scope="module")
-def kinematics(hand):
-    return jax.jit(lambda joints: forward_kinematics(hand, joints))
-
-
-@pytest.mark.parametrize(("angle", "bend", "tips"), [(0.0, 0.0, TIPS_AT_ZERO), (0.5, 0.1, TIPS_AT_HALF)])
-def test_tips_are_where_the_joint_table_puts_them(hand, kinematics, angle, bend, tips):
-    joints = np.full(12, angle, np.float32)
-    joints[3] = bend
-    ours = kinematics(joints).tip_position
-    np.testing.assert_allclose(ours, [tips[name] for name in hand.finger_names], atol=1e-5)
+@pytest.mark.parametrize("entry", PUBLISHED["tips"], ids=lambda entry: entry["hand"])
+def test_tips_are_where_the_published_chains_put_them(entry):
+    hand = load_hand(entry["hand"])
+    joints = np.broadcast_to(np.float32(entry["joints"]), hand.num_joints)
+    tips = jax.jit(forward_kinematics, static_argnums=0)(hand, joints).tip_position
+    np.testing.assert_allclose(tips, [entry[name] for name in hand.finger_names], atol=entry["within"])
 
 
 def test_finger_and_joint_tables(hand):
     assert hand.finger_names == ("thumb", "index", "middle", "ring", "pinky")
-    assert hand.joint_names == tuple(row[0] for row in JOINTS)
-    table = np.array([row[1:] for row in JOINTS])
+    assert hand.joint_names == tuple(PUBLISHED["joints"])
     ours = np.stack([hand.joint_lower, hand.joint_upper, hand.torque_limit, hand.speed_limit], 1)
-    np.testing.assert_allclose(ours, table, rtol=1e-6)
-    assert [hand.joint_names[j] for j in hand.root_joint] == [
-        "thumb_rota1",
-        "index_joint1",
-        "mid_joint1",
-        "ring_joint1",
-        "pinky_joint1",
-    ]
+    np.testing.assert_allclose(ours, list(PUBLISHED["joints"].values()), rtol=1e-6)
+    roots = ["thumb_rota1", "index_joint1", "mid_joint1", "ring_joint1", "pinky_joint1"]
+    assert [hand.joint_names[j] for j in hand.root_joint] == roots
     assert (hand.num_joints, hand.num_fingers, hand.num_taxels) == (12, 5, 120)
 
 
@@ -97,49 +54,16 @@ def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(hand):
         np.testing.assert_allclose(share.max(), 1.0, rtol=1e-4)
 
 
-@pytest.mark.parametrize("finger", [0, 4])
-def test_taxels_are_the_published_lattice(hand, finger):
-    table = THUMB_TAXELS if finger == 0 else FINGER_TAXELS
+def test_taxels_are_the_published_lattice(hand):
     assert hand.taxel_grid == (10, 12) and hand.taxel_position.shape == (5, 120, 3)
-    for (column, row), millimetres in table.items():
-        np.testing.assert_allclose(
-            hand.taxel_position[finger, (column - 1) * 12 + row - 1] * 1e3, millimetres, atol=1e-3
-        )
-
-
-# --- the example hands ---------------------------------------------------------------------------
-
-# Tips (m, palm frame) by finger with all motors at 0 and at 0.4 rad, multiplied out from the published chains: LEAP
-# Hand of MuJoCo Menagerie (right_hand.xml; ends of its fingertip meshes), Inspire RH56 of dexsuite/dex-urdf.
-TIPS = {
-    "leap_like": {
-        "thumb": [(0.0215, 0.1387, -0.0823), (0.0897, 0.0975, -0.0246)],
-        "index": [(0.0195, 0.0080, 0.1322), (0.1100, -0.0243, 0.0786)],
-        "middle": [(0.0195, -0.0374, 0.1321), (0.1100, -0.0697, 0.0785)],
-        "ring": [(0.0195, -0.0828, 0.1321), (0.1100, -0.1151, 0.0786)],
-    },
-    "inspire_like": {
-        "thumb": [(0.0438, 0.1127, 0.1186), (0.0402, 0.0490, 0.1551)],
-        "index": [(0.0011, 0.0290, 0.2137), (0.0468, 0.0284, 0.1966)],
-        "middle": [(0.0010, 0.0069, 0.2171), (0.0489, 0.0069, 0.1991)],
-        "ring": [(0.0009, -0.0163, 0.2135), (0.0466, -0.0154, 0.1965)],
-        "pinky": [(0.0013, -0.0387, 0.2037), (0.0410, -0.0371, 0.1891)],
-    },
-}
-
-
-@pytest.mark.parametrize("name", TIPS)
-def test_tips_are_where_the_published_chains_put_them(name):
-    hand = load_hand(name)
-    kinematics = jax.jit(lambda joints: forward_kinematics(hand, joints).tip_position)
-    for row, angle in enumerate((0.0, 0.4)):
-        tips = kinematics(np.full(hand.num_joints, angle, np.float32))
-        wanted = [TIPS[name][finger][row] for finger in hand.finger_names]
-        np.testing.assert_allclose(tips, wanted, atol=6e-4)  # places are rounded to 0.1 mm
+    for name, taxels in PUBLISHED["taxels"].items():
+        for column, row, *millimetres in taxels:
+            place = hand.taxel_position[hand.finger_names.index(name), (column - 1) * 12 + row - 1]
+            np.testing.assert_allclose(1e3 * place, millimetres, atol=1e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TIPS)
+@pytest.mark.parametrize("name", ["leap_like", "inspire_like"])
 def test_passes_the_checks(name, capsys):
     assert check_hand.main([name]) == 0
     out = capsys.readouterr().out
@@ -173,16 +97,12 @@ BROKEN = {
     "no range": ("xml", BEND, 'axis="-1 0 0" range="0 0" limited="false" actuatorfrcrange="-1 1"', "index_bend"),
     "no torque limit": ("xml", BEND, 'axis="-1 0 0" range="-0.174 0.174"', "actuatorfrcrange"),
     "no inertia": ("xml", '<inertial mass="0.0158240"', '<inertial mass="0"', "mass"),
-    "tip twice": ("toml", 'tip = "ring_tip"', 'tip = "mid_tip"', "'mid_tip' is on"),
     "unknown joint": ("toml", '"index_bend",', '"index_bent",', "Invalid name 'index_bent'"),
     "root joint of another finger": ("toml", 'root_joint = "mid_joint1"', 'root_joint = "ring_joint1"', "not move"),
     "misspelt entry": ("toml", "palm = ", "taxel_pich = 1\npalm = ", "'taxel_pich'"),
     "posture in degrees": ("toml", "posture = [1.45", "posture = [83", "83 rad of 'thumb_bend'"),
-    "column outside": ("csv", "thumb,0,1,", "thumb,10,1,", ":3: column 10"),
     "not a number": ("csv", "thumb,0,1,-0.01500", "thumb,0,1,nan", "'thumb' has 119"),
-    "no pitch of a lattice": ("leap", "taxel_pitch = [0.0035, 0.0035]\n", "", "either taxels"),
     "no such pad": ("leap", 'pad = "index_pad"', 'pad = "palm"', "finger 'index': pad = 'palm'"),
-    "along the pad": ("leap", "facing = [0, 0, 1]", "facing = [0, 1, 0]", "across the pad 'thumb_pad'"),
     "normal of length zero": ("csv", "-0.97944,-0.04477,0.19669", "0,0,0", ":2: the normal"),
 }
 

@@ -1,4 +1,4 @@
-"""Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
+"""Lattices on surfaces against their geometry; refusals."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from shapes import solid
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry.distance import distance_and_normal
-from dexsim.hand.layout import lay_taxels, read_taxels, write_layout
+from dexsim.hand.layout import lay_taxels
 from dexsim.hand.load import load_hand
 
 
@@ -50,12 +50,6 @@ def test_taxels_lie_on_their_surface_wherever_it_is(straight):
     for grid, says in (((90, 3), "laps itself"), ((3, 90), "beyond the pole")):
         with pytest.raises(ConfigError, match=says):
             lay_taxels(grid, pitch=0.002, **sizes)
-
-
-def test_a_written_layout_is_read_back(tmp_path):
-    taxels = lay_taxels((4, 3), pitch=0.002, radius=0.01)
-    path = write_layout(tmp_path / "taxels.csv", {"a": taxels, "b": taxels[::-1]}, (4, 3))
-    np.testing.assert_allclose(read_taxels(path, ("b", "a"), (4, 3)), [taxels[::-1], taxels], atol=1e-6)
 
 
 def test_taxels_of_a_pad_are_on_it_and_face_as_told():

@@ -98,17 +98,6 @@ def test_latency_holdout_and_report():
         assert word in result.report()
 
 
-@pytest.mark.slow
-def test_a_dead_band_is_found():
-    log = log_of(TRUTH, 6, target=SHORT)
-    known = TRUTH | dict(stiffness=3.5, damping=0.13, coulomb_friction=0.0, dead_band=0.0)
-    result = identify(log, known, fit=("stiffness", "damping", "coulomb_friction"), latencies=(2,))
-    assert result.rmse < 0.0011
-    for name in result.fitted:
-        low, high = result.intervals[name]
-        assert low <= TRUTH[name] <= high and high - low < 0.5 * TRUTH[name] + 2e-3, name
-
-
 def c_log(truth, target, latency, timestep=5e-4, seed=0):
     """A log from C MuJoCo: hinge with frictionloss and damping, the PD law in its actuator, finer steps."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -217,26 +206,12 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
 
 
 def test_segments_that_disagree_widen_the_intervals():
-    """A constant in six segments of one level each: the interval of the mean of six numbers."""
+    """A constant in six segments of one level each: the interval of the mean of six numbers; a jackknife's is wider."""
     rng = np.random.default_rng(0)
     level, segment = rng.standard_normal(6), np.repeat(np.arange(6), 50)
     residual = (level - level.mean())[segment]
     half = uncertainty(np.ones((300, 1)), residual, np.ones(1), segment)[0]
     assert half[0] == pytest.approx(scipy.stats.t.ppf(0.975, 5) * np.std(level, ddof=1) / np.sqrt(6), rel=1e-6)
-
-
-def test_an_interval_is_no_wider_where_one_stretch_alone_shows_a_parameter():
-    """Without that stretch next to nothing would: a jackknife gives 17 times the width."""
-    rng = np.random.default_rng(0)
-    jacobian, one = np.column_stack([np.ones(400), 0.01 * rng.standard_normal(400)]), np.zeros(400, int)
-    jacobian[100:120, 1] += rng.standard_normal(20)
-    left = np.linalg.svd(jacobian, full_matrices=False)[0]
-    ratios = []
-    for noise in 0.1 * rng.standard_normal((20, 400)):
-        residual = noise - left @ (left.T @ noise)
-        half = uncertainty(jacobian, residual, np.ones(2), one)[0]
-        ratios.append(half / (1.96 * np.std(residual) * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))))
-    assert np.all(np.median(ratios, 0) < 1.5) and np.max(ratios) < 4
 
 
 def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
@@ -254,14 +229,10 @@ def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
     ("changes", "says"),
     [
         (dict(target=TARGET[:100], position=TARGET[:100]), "at least 200 samples"),
-        (dict(position=TARGET[:-1]), "arrays of one length"),
-        (dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)), "not a number"),
         (dict(period=15.0), "period of 15 s: give seconds"),
         (dict(position=np.rad2deg(TARGET), target=np.rad2deg(TARGET)), "give rad"),
         (dict(target=TARGET / 57.3), "same unit"),
-        (dict(position=0 * TARGET + 0.9), "moved over 0 rad"),
         (dict(torque=np.where(np.arange(len(TARGET)) % 3 < 2, 0.4, 0.1)), "saturated"),
-        (dict(torque=1e3 * np.sin(np.arange(len(TARGET)))), "give Nm"),
     ],
 )
 def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):

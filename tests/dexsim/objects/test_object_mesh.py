@@ -38,25 +38,25 @@ def folder(tmp_path_factory):
     return path
 
 
-class TestBoxes:
-    def test_a_cuboid_gives_back_a_cuboid(self, folder):
-        mesh_object = load(str(folder / "cuboid.ply"), unit=0.001, parts=ObjectConfig().mesh_parts)
-        assert len(mesh_object.boxes.size) == 1 and max(mesh_object.boxes.deviation) < 1e-6
-        np.testing.assert_allclose(mesh_object.boxes.size, [[0.025, 0.018, 0.032]], rtol=1e-4)
-        np.testing.assert_allclose(mesh_object.boxes.position, 0, atol=1e-6)
-        np.testing.assert_allclose(np.abs(mesh_object.boxes.quat), [[1, 0, 0, 0]], atol=1e-4)
-        square = np.array([0.05, 0.036, 0.064]) ** 2
-        np.testing.assert_allclose(mesh_object.inertia, (square.sum() - square) / 12, rtol=1e-6)
+def test_a_cuboid_gives_back_a_cuboid(folder):
+    mesh_object = load(str(folder / "cuboid.ply"), unit=0.001, parts=ObjectConfig().mesh_parts)
+    assert len(mesh_object.boxes.size) == 1 and max(mesh_object.boxes.deviation) < 1e-6
+    np.testing.assert_allclose(mesh_object.boxes.size, [[0.025, 0.018, 0.032]], rtol=1e-4)
+    np.testing.assert_allclose(mesh_object.boxes.position, 0, atol=1e-6)
+    np.testing.assert_allclose(np.abs(mesh_object.boxes.quat), [[1, 0, 0, 0]], atol=1e-4)
+    square = np.array([0.05, 0.036, 0.064]) ** 2
+    np.testing.assert_allclose(mesh_object.inertia, (square.sum() - square) / 12, rtol=1e-6)
 
-    @pytest.mark.slow
-    def test_an_l_is_two_bars(self, folder):
-        """In the object's frame, which lies askew to them."""
-        mesh_object, solid = load(str(folder / "ell.obj"), unit=1.0, parts=6), ell()
-        axes = principal_axes(solid.moment_inertia / solid.mass)
-        assert len(mesh_object.boxes.size) == 2 and 0.3 < np.arccos(axes[0, 0]) < 0.8
-        corners = (np.asarray(solid.vertices) - solid.center_mass) @ axes
-        on_surface = np.abs(sdf.signed_distance(jnp.float32(corners), mesh_object.boxes.shape()))
-        assert on_surface.max() < 3e-4 and max(mesh_object.boxes.deviation) < 3e-4
+
+@pytest.mark.slow
+def test_an_l_is_two_bars(folder):
+    """In the object's frame, which lies askew to them."""
+    mesh_object, solid = load(str(folder / "ell.obj"), unit=1.0, parts=6), ell()
+    axes = principal_axes(solid.moment_inertia / solid.mass)
+    assert len(mesh_object.boxes.size) == 2 and 0.3 < np.arccos(axes[0, 0]) < 0.8
+    corners = (np.asarray(solid.vertices) - solid.center_mass) @ axes
+    on_surface = np.abs(sdf.signed_distance(jnp.float32(corners), mesh_object.boxes.shape()))
+    assert on_surface.max() < 3e-4 and max(mesh_object.boxes.deviation) < 3e-4
 
 
 def test_loose_vertices_are_no_part_of_a_mesh():
@@ -65,60 +65,43 @@ def test_loose_vertices_are_no_part_of_a_mesh():
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), 0.05)
 
 
-class TestErrors:
-    """One clear line each."""
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("ring.stl", "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
+        ("large.stl", r"at scale 1, .* pass scale=0.001 for a file in millimetres .ObjectConfig.mesh_unit"),
+        ("hollow.stl", "a mesh of 60 mm has no inside at a resolution of .* its walls are too thin for boxes"),
+    ],
+)
+def test_a_mesh_that_will_not_do(hand, tmp_path, name, message):
+    trimesh.creation.torus(0.05, 0.01, major_sections=24, minor_sections=8).export(tmp_path / "ring.stl")
+    trimesh.creation.box((50, 50, 50)).export(tmp_path / "large.stl")
+    cavity = trimesh.creation.box((0.059, 0.059, 0.059))
+    cavity.invert()
+    trimesh.util.concatenate([trimesh.creation.box((0.06, 0.06, 0.06)), cavity]).export(tmp_path / "hollow.stl")
+    with pytest.raises(AssetError, match=message):
+        dexsim.make("grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=1)), hand=hand)
 
-    @pytest.mark.parametrize(
-        ("name", "parts", "message"),
-        [
-            ("none.stl", 6, "none.stl"),
-            ("open.stl", 6, "the surface is open"),
-            ("ring.stl", 1, "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
-            ("large.stl", 6, r"at scale 1, .* pass scale=0.001 for a file in millimetres .ObjectConfig.mesh_unit"),
-            ("hollow.stl", 6, "a mesh of 60 mm has no inside at a resolution of .* its walls are too thin for boxes"),
-        ],
+
+def test_sizes_masses_and_inertia_drawn_are_of_the_solid(folder):
+    config = ObjectConfig(
+        mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.8, 1.2), inertia_scale=(1.0, 1.0)
     )
-    def test_a_mesh_that_will_not_do(self, hand, tmp_path, name, parts, message):
-        cube = trimesh.creation.box((0.05, 0.05, 0.05))
-        trimesh.Trimesh(cube.vertices, cube.faces[1:], process=False).export(tmp_path / "open.stl")
-        trimesh.creation.torus(0.05, 0.01, major_sections=24, minor_sections=8).export(tmp_path / "ring.stl")
-        trimesh.creation.box((50, 50, 50)).export(tmp_path / "large.stl")
-        cavity = trimesh.creation.box((0.059, 0.059, 0.059))
-        cavity.invert()
-        trimesh.util.concatenate([trimesh.creation.box((0.06, 0.06, 0.06)), cavity]).export(tmp_path / "hollow.stl")
-        with pytest.raises(AssetError, match=message) as caught:
-            dexsim.make(
-                "grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=parts)), hand=hand
-            )
-        assert "\n" not in str(caught.value)
-
-
-class TestDraw:
-    def config(self, folder, **more):
-        return ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.8, 1.2), **more)
-
-    def test_sizes_masses_and_inertia_are_of_the_solid(self, folder):
-        config = self.config(folder, inertia_scale=(1.0, 1.0))
-        draw = jit(jax.vmap(lambda key: sample_object(key, config)), once=True)
-        drawn = draw(jax.random.split(jax.random.key(0), 200))
-        sides = 2 * np.asarray(drawn.size[:, 0])
-        factor = sides[:, 0] / 0.05
-        np.testing.assert_allclose(sides, factor[:, None] * [0.05, 0.036, 0.064], rtol=1e-4)
-        assert 0.8 <= factor.min() < 0.85 and 1.15 < factor.max() <= 1.2 + 1e-6
-        square = sides**2
-        solid = np.asarray(drawn.mass)[:, None] / 12 * (square.sum(1, keepdims=True) - square)
-        np.testing.assert_allclose(drawn.inertia, solid, rtol=1e-4)
-        assert np.all(drawn.shape_index == KINDS.index("mesh")) and np.ptp(drawn.mass) > 0.1
-
-
-@pytest.fixture
-def simple(monkeypatch):
-    monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
+    draw = jit(jax.vmap(lambda key: sample_object(key, config)), once=True)
+    drawn = draw(jax.random.split(jax.random.key(0), 200))
+    sides = 2 * np.asarray(drawn.size[:, 0])
+    factor = sides[:, 0] / 0.05
+    np.testing.assert_allclose(sides, factor[:, None] * [0.05, 0.036, 0.064], rtol=1e-4)
+    assert 0.8 <= factor.min() < 0.85 and 1.15 < factor.max() <= 1.2 + 1e-6
+    solid = np.asarray(drawn.mass)[:, None] / 12 * (np.sum(sides**2, 1, keepdims=True) - sides**2)
+    np.testing.assert_allclose(drawn.inertia, solid, rtol=1e-4)
+    assert np.all(drawn.shape_index == KINDS.index("mesh")) and np.ptp(drawn.mass) > 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
-def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method):
+def test_taxels_feel_the_mesh_at_the_size_of_the_episode(monkeypatch, folder, method):
+    monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
     objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="c")
     targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.object)

@@ -10,10 +10,9 @@ import sys
 import c_scene
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
-from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
+from c_scene import GRAVITY, row, rows_of, squeeze, stack
 from paths import ROOT
 
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
@@ -23,7 +22,6 @@ from dexsim.physics.interface import PhysicsState, configured
 from dexsim.physics.physics import Physics
 
 WORLDS = 8
-AWAY = np.array([1.0, 0.0, 0.0])  # m, where nothing is near: the palm's face is a half-space
 
 
 def make(hand, **changes):
@@ -69,31 +67,9 @@ def batch_of(grips):
     return stack([start.object for start in starts]), state, np.stack(torque)
 
 
-def at(grips, place, velocity=(0,) * 6):
-    """Objects of some grips elsewhere, the hand flat and at rest."""
-    target, _, _ = batch_of(grips)
-    count = len(grips)
-    qpos = np.concatenate([np.zeros(12), place, [1, 0, 0, 0]])
-    qvel = np.concatenate([np.zeros(12), velocity])
-    rows = (np.tile(np.float32(x), (count, 1)) for x in (qpos, qvel, np.zeros(18)))
-    return target, PhysicsState(*rows)
-
-
 def assert_same(first, second):
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
-
-
-def test_free_fall_under_a_push(tick, grips):
-    """Semi-implicit Euler: after n steps v = n a dt and x = n (n + 1) / 2 a dt^2."""
-    target, state = at(grips[:WORLDS], AWAY)
-    push = np.float32(np.random.default_rng(1).normal(size=(WORLDS, 3)))
-    after, force = jax.device_get(tick(target, state, push))
-    acceleration = np.array(GRAVITY) + push / np.asarray(target.mass)[:, None]
-    np.testing.assert_allclose(after.qvel[:, 12:15], 3 * 0.01 * acceleration, rtol=1e-5)
-    np.testing.assert_allclose(after.qpos[:, 12:15] - AWAY, 6 * 0.01**2 * acceleration, atol=2e-7)
-    assert not np.any(np.asarray(force))
-    np.testing.assert_allclose(after.warmstart[:, 12:15], acceleration, rtol=1e-5)
 
 
 class TestForces:
@@ -103,11 +79,7 @@ class TestForces:
         after, force = one_step(target, state, torque, jnp.zeros((len(grips), 3)))
         touched = 0
         for index, (start, _, *begun, applied) in enumerate(grips):
-            model = c_scene.compile_scene(hand, start.object, exact=True, **CONVERGED)
-            data = c_scene.start(model, *begun)
-            data.qfrc_applied[:12] = applied
-            mujoco.mj_step(model, data)
-            expected = c_scene.finger_force(model, data, hand)
+            data, expected = c_scene.step(hand, start.object, begun, applied, exact=True)
             touched += np.linalg.norm(expected, axis=-1).max() > 0.5
             np.testing.assert_allclose(force[index], expected, atol=2e-3 + 1e-4 * np.abs(expected).max())
             np.testing.assert_allclose(after.qvel[index], data.qvel, atol=1e-3)
@@ -146,17 +118,11 @@ def test_batches_of_any_size_and_order_loops_and_scans_give_the_same_bits(physic
 
 
 class TestTrouble:
-    def test_a_world_that_diverges_is_marked_and_alone(self, tick, grips):
+    def test_a_world_that_diverges_is_marked(self, tick, grips):
         target, state, _ = batch_of(grips[:4])
-        push = jnp.zeros((4, 3))
-        expected = tick(target, state, push)
-        broken = jax.tree.map(np.copy, state)
-        broken.qpos[1, 3], broken.qvel[2, 14] = np.nan, 1e12
-        after = tick(target, broken, push)
-        assert np.isnan(np.asarray(after[1])[1:3]).all()
-        sound = jax.tree.map(lambda x: x[np.array([0, 3])], (after, expected))
-        assert_same(*sound)
-        assert_same(tick(target, state, push), expected)
+        state.qpos[1, 3], state.qvel[2, 14] = np.nan, 1e12
+        force = np.asarray(tick(target, state, jnp.zeros((4, 3)))[1])
+        assert np.isnan(force).any((1, 2)).tolist() == [False, True, True, False]
 
     def test_full_memory_is_an_error(self, hand, grips, monkeypatch):
         """MuJoCo drops contacts that do not fit, with a warning that no one sees; with less room its solver stops."""
@@ -237,11 +203,10 @@ def scenes(hand):
 
 
 @pytest.fixture(scope="module")
-def grip(hand, grasp_env):
-    """(object, state) of a squeezed box."""
-    start = row(grasp_env.pool, rows_of(grasp_env.pool, "box")[0])
-    _, qpos, qvel, warmstart, torque = squeeze(hand, start, np.random.default_rng(0))
-    return start.object, PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(warmstart)), torque
+def grip(grips):
+    """(object, state, torque) of a squeezed box."""
+    start, _, *state, torque = grips[WORLDS * SHAPES.index("box")]
+    return start.object, PhysicsState(*map(jnp.asarray, state)), torque
 
 
 @pytest.mark.parametrize(("change", "compiled"), [(THIN - THICK, THIN), (-THICK, 0.0), (-0.01, 0.0)])

@@ -84,7 +84,7 @@ def states(grasp_rollout):
     """Start states, a few ticks on: objects lie on the hand."""
     state = grasp_rollout.reset(jax.random.key(0))
     for _ in range(6):
-        state = grasp_rollout.step(state, jnp.full(state.joint_target.shape, 0.5))
+        state = grasp_rollout.step(state, jnp.full(state.joint_target.shape, 0.5, jnp.float32))
     return state
 
 

@@ -10,16 +10,7 @@ import warp_emulation
 from physics_states import scene_of_model
 from scipy.spatial.transform import Rotation
 
-from dexsim.physics.cuda.scene import (
-    MAX_CONTACTS,
-    Buffer,
-    Links,
-    args_type,
-    declare_args,
-    find_links,
-    kernel_constants,
-    rotation_matrix,
-)
+from dexsim.physics.cuda import scene as cuda_scene
 from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -81,8 +72,8 @@ def geom_type(kind: str) -> int:
 
 
 @functools.cache
-def links_of(slots: tuple[str, ...]) -> Links:
-    return find_links(scene_of(slots))
+def links_of(slots: tuple[str, ...]) -> cuda_scene.Links:
+    return cuda_scene.find_links(scene_of(slots))
 
 
 @functools.cache
@@ -91,15 +82,16 @@ def finder(slots: tuple[str, ...]):
     scene = scene_of(slots)
     primitives, tips = len(slots), len(scene.tip_geoms)
     sizes = {"geom_size": 3 * (primitives + tips), "geom_pos": 3 * primitives, "geom_quat": 4 * primitives}
-    text = "\n".join([declare_args([Buffer(*each) for each in sizes.items()]), kernel_constants(scene)])
+    buffers = [cuda_scene.Buffer(*each) for each in sizes.items()]
+    text = cuda_scene.declare_args(buffers) + cuda_scene.kernel_constants(scene)
     library = ctypes.CDLL(str(warp_emulation.build(text, "contacts.cpp")))
 
     def find(worlds):
         """Contacts [N, MAX_CONTACTS] of worlds and their numbers [N]."""
         arrays = [np.array(parts, np.float32) for parts in zip(*(world.arrays() for world in worlds), strict=True)]
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
-        contacts, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
-        args = args_type(3)((ctypes.c_void_p * 3)(*pointers[:3]), len(worlds))
+        contacts, count = np.zeros((len(worlds), cuda_scene.MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
+        args = cuda_scene.args_type(3)((ctypes.c_void_p * 3)(*pointers[:3]), len(worlds))
         outputs = (part.ctypes.data_as(ctypes.c_void_p) for part in (contacts, count))
         library.find(ctypes.byref(args), *pointers[3:], *outputs)
         return contacts, count
@@ -118,7 +110,7 @@ class World:
         self.turn = Rotation.random(model.ngeom, random_state=random).as_matrix()
         self.floor = model.geom("floor").id
         self.place[self.floor] = model.geom_pos[self.floor]
-        self.turn[self.floor] = rotation_matrix(model.geom_quat[self.floor])
+        self.turn[self.floor] = cuda_scene.rotation_matrix(model.geom_quat[self.floor])
 
     def in_mujoco(self) -> mujoco.MjData:
         model, data = self.scene.model, mujoco.MjData(self.scene.model)
@@ -134,7 +126,7 @@ class World:
         poses = np.tile(pose(np.eye(3), 0), (links.hinges + 1, 1))
         for geom, body in enumerate(model.geom_bodyid):
             if 0 <= links.link[body] < links.hinges:
-                turn = self.turn[geom] @ (links.rotation[body] @ rotation_matrix(model.geom_quat[geom])).T
+                turn = self.turn[geom] @ (links.rotation[body] @ cuda_scene.rotation_matrix(model.geom_quat[geom])).T
                 here = links.place[body] + links.rotation[body] @ model.geom_pos[geom]
                 poses[links.link[body]] = pose(turn, self.place[geom] - turn @ here)
         nearest = np.linalg.norm(self.place[geoms], axis=1).argmin()
@@ -222,6 +214,6 @@ def test_deepest_contacts_of_a_mesh_are_kept():
     crowded = 0
     for world, rows, number in zip(worlds, contacts, count, strict=True):
         gaps = np.sort(world.in_mujoco().contact.dist)
-        np.testing.assert_allclose(np.sort(rows["gap"][:number]), gaps[:MAX_CONTACTS], atol=1e-5)
-        crowded += len(gaps) > MAX_CONTACTS
+        np.testing.assert_allclose(np.sort(rows["gap"][:number]), gaps[: cuda_scene.MAX_CONTACTS], atol=1e-5)
+        crowded += len(gaps) > cuda_scene.MAX_CONTACTS
     assert crowded > 3

@@ -27,15 +27,6 @@ def recorded():
     return read_episodes(asset_path("episodes") / "grasp.npz")
 
 
-@pytest.fixture(scope="module")
-def loose(recorded):
-    """A loosely closed hand that feels nothing, over no object."""
-    first = recorded.snapshots[0].map(operator.itemgetter(0))
-    joints = np.float32([1.4, 0.2, 0.3, 0.0] + [0.8, 0.5] * 4)
-    nothing = {name: np.zeros_like(getattr(first, name)) for name in ("primitive_active", "taxel_force")}
-    return dataclasses.replace(first, joint_position=joints, **nothing)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_rays_hit_the_surface_with_outward_normals(kind):
     """Sizes, poses and the projection are MuJoCo's: by the distance functions that the taxels use."""
@@ -59,8 +50,13 @@ def test_rays_hit_the_surface_with_outward_normals(kind):
     np.testing.assert_allclose(depth, surface.depth[seen], rtol=1e-6)
 
 
-def test_a_loaded_taxel_shows_on_the_finger(hand, recorded, loose):
-    """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
+def test_a_loaded_taxel_shows_on_the_finger(hand, recorded):
+    """Of two pictures of a loosely closed hand without an object, which differ in one taxel's force, the pixels around
+    that taxel differ and turn hot."""
+    first = recorded.snapshots[0].map(operator.itemgetter(0))
+    joints = np.float32([1.4, 0.2, 0.3, 0.0] + [0.8, 0.5] * 4)
+    nothing = {name: np.zeros_like(getattr(first, name)) for name in ("primitive_active", "taxel_force")}
+    loose = dataclasses.replace(first, joint_position=joints, **nothing)
     pose = render.hand_poses(hand, loose.joint_position[None])[0]
     size = (640, 480)
     view = look(render.CAMERAS["grasp"], (400, 480))

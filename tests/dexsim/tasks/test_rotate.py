@@ -39,12 +39,6 @@ def quat_of(rotation: Rotation) -> np.ndarray:
 draw_object = jax.jit(sample_turned_object, static_argnums=1)
 
 
-def truth(task: Rotate, **changes) -> GroundTruth:
-    """The cube at the reference, aligned and at rest, in a hand that touches nothing."""
-    object = draw_object(jax.random.key(0), RotateConfig())
-    return still_moment(task.hand, task.reference, object=object, **changes)
-
-
 def turned(degrees: float, axis=(1, 0, 0)) -> np.ndarray:
     return quat_of(Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis)))
 
@@ -64,7 +58,9 @@ class Rules:
         self.waiting = jax.tree.map(lambda x: x[0], self.task.evaluation_plan(1, np.zeros(4, int))[1])
 
     def truth(self, **changes) -> GroundTruth:
-        return truth(self.task, **changes)
+        """The cube at the reference, aligned and at rest, in a hand that touches nothing."""
+        cube = draw_object(jax.random.key(0), RotateConfig())
+        return still_moment(self.task.hand, self.task.reference, object=cube, **changes)
 
     def rewards(self, goal, here, dropped=False):
         """Reward and its terms and metrics."""
@@ -100,12 +96,8 @@ class TestGoal:
             here = rules.truth(**{"object_quat": turned(90)} | changes)
             return bool(rules.progress(rules.begun, here).success)
 
-        assert [reached(object_quat=turned(angle)) for angle in (72.5, 73.5, 106.5, 107.5)] == [
-            False,
-            True,
-            True,
-            False,
-        ]
+        for angle, inside in ((72.5, False), (73.5, True), (106.5, True), (107.5, False)):
+            assert reached(object_quat=turned(angle)) == inside
         assert reached(object_position=rules.reference + [0, 0.049, 0])
         assert not reached(object_position=rules.reference + [0, 0.051, 0])
         assert reached(object_spin=[1.9, 5, 5])
@@ -138,18 +130,11 @@ def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
 class TestReward:
     def test_the_papers_reward_is_its_three_terms(self, rules_of):
         assert paper().control.last_action_encoding == "action"
-        rules, action = rules_of(paper()), np.linspace(-1, 1, 12).astype(np.float32)
-        busy = dict(
-            action=action,
-            joint_velocity=np.full(12, 3.0),
-            joint_torque=np.full(12, 0.5),
-            finger_force=np.full((5, 3), 2.0),
-            object_spin=[9.0, 0, 0],
-        )
-        cost = -0.0002 * float(np.sum(action**2))
+        rules, action = rules_of(paper()), np.linspace(-1, 1, 12)
         for degrees, earned in ((45, 1 / (math.pi / 4 + 0.1)), (90, 250 + 1 / 0.1)):
-            reward, _ = rules.rewards(rules.begun, rules.truth(object_quat=turned(degrees), **busy))
-            np.testing.assert_allclose(reward, earned + cost, rtol=1e-4)
+            busy = moment(rules, action=action, object_spin=[9.0, 0, 0], object_quat=turned(degrees))
+            reward, _ = rules.rewards(rules.begun, busy)
+            np.testing.assert_allclose(reward, earned - 0.0002 * np.sum(action**2), rtol=1e-4)
 
     def test_fingertips_at_work_earn_the_rest_of_the_bonus(self, rules):
         tips = RotateReward().bonus_tips
@@ -341,21 +326,15 @@ class TestDrop:
                 here = of.truth(object_position=of.reference + [0, 0, distance])
                 assert bool(of.dropped(goal, here)) == lost
 
-    def test_lowest_corner_of_a_tilted_cube(self):
-        target = draw_object(jax.random.key(3), RotateConfig())
-        half, place = float(target.size[0, 0]), np.array([0.06, 0.0, 0.08])
-        corners = half * CORNERS
-        for seed in range(5):
-            rotation = Rotation.random(random_state=seed)
-            low = np.min(rotation.apply(corners)[:, 0]) + place[0]
-            np.testing.assert_allclose(lowest_point(target, quat_of(rotation), jnp.asarray(place)), low, atol=1e-6)
-
-    def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand, rules_of):
-        rules = rules_of(RotateConfig(support="fingers"))
-        height = palm_height(hand) + float(rules.truth().object.size[0, 0])
+    @pytest.mark.parametrize("turn", [(0, 0, 0), (0.5, 0.4, 0), (-0.3, 0.2, 0.6)])
+    def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand, rules_of, turn):
+        """By its lowest corner."""
+        rules, rotation = rules_of(RotateConfig(support="fingers")), Rotation.from_rotvec(turn)
+        reach = float(rules.truth().object.size[0, 0]) * np.max(rotation.apply(CORNERS)[:, 0])
         for gap, lost in ((0.0005, True), (0.0015, False)):
-            place = rules.reference * [0, 1, 1] + [height + gap, 0, 0]
-            assert bool(rules.dropped(rules.begun, rules.truth(object_position=place))) == lost
+            place = rules.reference * [0, 1, 1] + [palm_height(hand) + reach + gap, 0, 0]
+            here = rules.truth(object_position=place, object_quat=quat_of(rotation))
+            assert bool(rules.dropped(rules.begun, here)) == lost
 
 
 def test_boxes_and_cylinders_have_the_inertia_that_mujoco_computes():

@@ -21,9 +21,10 @@ def test_it_steps_as_the_environment_does():
     state = jax.vmap(lambda seed: ours.reset(jax.random.key(seed)))(np.arange(3, 7))
     np.testing.assert_array_equal(seen, state.obs["actor"])
     env.action_space.seed(0)
+    step = jax.jit(jax.vmap(ours.step))
     for _ in range(5):
         action = env.action_space.sample()
-        state = jax.vmap(ours.step)(state, action)
+        state = step(state, action)
         seen, reward, terminated, truncated, info = env.step(action)
         np.testing.assert_allclose(seen, state.obs["actor"], rtol=1e-6)
         np.testing.assert_allclose(reward, state.reward, rtol=1e-6)
@@ -33,10 +34,10 @@ def test_it_steps_as_the_environment_does():
 def test_a_finished_episode_restarts_in_the_same_step_and_leaves_its_last_observation():
     ours, env = TinyEnv(), GymVectorEnv(TinyEnv(), 3)
     env.reset(seed=0)
-    before = env._state
+    before, step = env._state, jax.jit(jax.vmap(ours.step))
     for _ in range(200):
         action = np.zeros(env.action_space.shape, np.float32)
-        state = jax.vmap(ours.step)(before, action)
+        state = step(before, action)
         seen, _, terminated, truncated, info = env.step(action)
         before = env._state
         if (terminated | truncated).any():

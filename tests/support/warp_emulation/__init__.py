@@ -42,16 +42,7 @@ class Emulation:
         self._run = library.run
         self._arguments = cuda_scene.args_type(len(self.buffers))
 
-    def run(
-        self,
-        inputs: dict[str, np.ndarray],
-        *,
-        substeps: int,
-        iterations: int = 10,
-        line_search: int = 20,
-        tolerance: float = 1e-5,
-        line_search_tolerance: float = 0.01,
-    ) -> dict[str, np.ndarray]:
+    def run(self, inputs, *, substeps, iterations=10, line_search=20, tolerance=1e-5, line_search_tolerance=0.01):
         """Outputs [N, ...] by name for inputs [N, ...]."""
         n = len(inputs["qpos"])
         arrays = {}
