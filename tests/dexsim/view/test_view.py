@@ -1,7 +1,9 @@
-"""The live view: what it draws, what its controls change, and the page's buttons."""
+"""The live view: what it draws, what its controls change, the page's buttons, and the page in a real browser."""
 
 import dataclasses
+import io
 import itertools
+import shutil
 import subprocess
 import sys
 import threading
@@ -211,6 +213,32 @@ def test_poses_for_pictures_are_those_of_the_kinematics(hand):
 # --- the page -------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def page(simulation):
+    """The page in a headless Chromium, its viewer running beside it."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium)")
+    pytest.importorskip("viser")
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
+
+    viewer, stop = Viewer(simulation, title="test", port=18080), threading.Event()
+    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
+    running.start()
+    with sync_playwright() as playwright:
+        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=chromium, args=software)
+        opened = browser.new_page(viewport={"width": 900, "height": 600})
+        opened.goto(viewer.url)
+        opened.wait_for_selector("canvas")
+        opened.viewer = viewer
+        yield opened
+        browser.close()
+    stop.set()
+    running.join(10)
+    assert not running.is_alive()
+
+
 def wait_until(condition, seconds=25.0):
     end = time.monotonic() + seconds
     while not (met := condition()) and time.monotonic() < end:
@@ -241,3 +269,18 @@ def test_the_page_runs_pauses_steps_and_begins_anew():
         stop.set()
         running.join(10)
     assert not running.is_alive()
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_hand(page):
+    from PIL import Image
+
+    def colors():
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[100:, :450]
+        return len(np.unique(picture.reshape(-1, 3), axis=0))
+
+    assert wait_until(lambda: colors() > 200), "the canvas stays empty"
+    page.viewer.paused.value = True
+    time.sleep(0.5)
+    page.get_by_role("button", name="reset").click()
+    assert wait_until(lambda: float(page.viewer.source._state.length) == 0)
