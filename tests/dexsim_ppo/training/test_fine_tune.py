@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_train import QUICK, exit_code
-from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
+from tiny_env import SMALL, TinyEnv
 
 from dexsim_ppo import train
 from dexsim_ppo.learner.ppo import make_train
@@ -19,8 +19,8 @@ from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import initialize_from
 
 
-def started(policy, config, env=None):
-    training = make_train(env or TinyEnv(), config, start=functools.partial(initialize_from, policy, config))
+def started(policy, config):
+    training = make_train(TinyEnv(), config, start=functools.partial(initialize_from, policy, config))
     return training, training.init(jax.random.key(1))
 
 
@@ -51,22 +51,6 @@ def test_the_critic_learns_first_and_then_both(policy):
         assert not np.array_equal(before.critic[0].kernel, after.critic[0].kernel)
     for mine, theirs in zip(params[2].actor, policy.params.layers, strict=True):
         np.testing.assert_array_equal(mine.kernel, theirs.kernel)
-
-
-def test_a_good_policy_is_not_worse_in_another_world():
-    """The return falls when the critic learns at the policy's small rate: the policy climbs its errors."""
-    training = make_train(TinyEnv(), CONFIG)
-    state = training.init(jax.random.key(0))
-    for _ in range(15):
-        state, _ = training.step(state)
-    policy = Policy.from_training(TinyEnv(), CONFIG, state)
-    config = dataclasses.replace(fine_tuning_config(policy, CONFIG), discount=0.99, critic_first=50)
-    training, state = started(policy, config, TinyEnv(TinyConfig(gain=0.1, horizon=64)))
-    returns = []
-    for _ in range(25):
-        state, metrics = training.step(state)
-        returns.append(np.nanmean(metrics["episode/return"]))
-    assert np.mean(returns[-5:]) > np.mean(returns[:5]) - 0.5
 
 
 @pytest.mark.slow
