@@ -118,6 +118,14 @@ def hand() -> Any:
 
 
 @pytest.fixture(scope="session")
+def left() -> Any:
+    """Its mirror image."""
+    from dexsim.hand.load import load_hand
+
+    return load_hand("xhand_left")
+
+
+@pytest.fixture(scope="session")
 def grasp_env() -> Any:
     """The grasp task on C MuJoCo, with imperfect taxels and a small pool (16 starts of each shape)."""
     import dexsim

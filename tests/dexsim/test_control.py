@@ -105,9 +105,6 @@ def test_an_estimate_is_the_taxels_and_a_share_of_what_the_torque_adds_and_zero_
         np.testing.assert_allclose(found, [2.0, second, 0.0, 6.0, 0.0], rtol=1e-6)
     unknown = dataclasses.replace(hand, force_per_torque=np.zeros(5, np.float32))
     np.testing.assert_allclose(estimate_force(ForceEstimate(), unknown, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
-    own = hand.force_per_torque * hand.torque_limit[hand.root_joint] * [0.1, 0.2, 0.3, 0.1, 0.4]
-    wanted = np.maximum([2.0, 0.5, 0.0, 6.0, 0.0], own * [1, 1, 0, 1, 0])
-    np.testing.assert_allclose(estimate_force(ForceEstimate(torque_share=1.0), hand, taxels, torque), wanted, rtol=1e-5)
 
 
 def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_same_targets(

@@ -15,7 +15,6 @@ from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
-from dexsim.hand.load import load_hand
 from dexsim.hand.mirror import POLAR, QUAT
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS, find_task, make_task
@@ -130,14 +129,6 @@ def test_the_rotation_policies_turn(name):
         assert not metrics["successes"].any()
 
 
-SECONDS = 1.0
-
-
-@pytest.fixture(scope="module")
-def left():
-    return load_hand("xhand_left")
-
-
 @pytest.mark.parametrize("name", ["grasp", "rotate", "rotate_clear"])
 def test_a_right_hands_policy_fits_the_left_one(left, name):
     policy = load_policy(name)
@@ -181,7 +172,7 @@ def test_both_hands_do_the_same_in_the_mirror(hand, left):
         step, act = jax.jit(env.step), jax.jit(lambda carry, obs, env=env: policy.act(carry, actor_of(env, obs)))
         reset = jax.jit(lambda key, begin, env=env: env.reset_from(key, begin, scale=jnp.zeros(())))
         state, carry, run = reset(jax.random.key(0), begin), policy.initial_carry(), []
-        for _ in range(round(SECONDS / env.control_period)):
+        for _ in range(round(1.0 / env.control_period)):
             carry, action = act(carry, state.obs)
             state = step(state, action)
             run.append((np.asarray(state.physics.qpos), np.asarray(state.finger_force), state.terminated))

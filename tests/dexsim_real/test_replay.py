@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, rewritten, summary
 
 from dexsim.core.errors import DexsimError
+from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim_real import replay, run
 from dexsim_real.core.log import Kind, LogError
 
@@ -45,6 +47,7 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
     drawn_and_taken_along(hand, tmp_path, ticks)
+    shown_in_the_live_view(tmp_path, ticks)
     forged(tmp_path)
     without_ticks(tmp_path)
 
@@ -76,6 +79,17 @@ def drawn_and_taken_along(hand, folder, ticks):
     lines = np.array([line.get_ydata() for axis in drawn[0].axes[:5] for line in axis.lines])
     np.testing.assert_array_equal(lines[0::2], angles.T)
     np.testing.assert_array_equal(lines[1::2], np.transpose(targets))
+
+
+def shown_in_the_live_view(folder, ticks):
+    """From the time on that its slider names."""
+    source, begin, limits = open_source(ViewArguments(what=str(folder / "run.log"))), SimpleNamespace(value=0.0), {}
+    source.add_controls(SimpleNamespace(add_slider=lambda name, **given: limits.update(given) or begin))
+    for frame, tick in zip(source.episode(), ticks, strict=True):
+        np.testing.assert_array_equal(frame.snapshot.joint_position, tick["readings"]["joint_position"])
+    assert frame.kinds == () and limits["max"] == pytest.approx(1.2, abs=0.2)
+    begin.value = 0.3
+    assert float(next(source.episode()).snapshot.seconds) == pytest.approx(0.3, abs=0.1)
 
 
 def forged(folder):

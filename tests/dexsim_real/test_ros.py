@@ -1,19 +1,97 @@
-"""The ROS 2 node with a stand-in of rclpy: messages, commands through the safety, and how it ends."""
+"""The ROS 2 node with a stand-in of rclpy and of the messages that it uses: what it publishes, commands through the
+safety, and how it ends."""
 
+import dataclasses
 import sys
 import time
+import types
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
-import rclpy_stand_in
 from scripted_driver import ScriptedDriver
 
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim_real import ros
 
 STEP = 0.012  # s
+
+
+def message(name, /, **fields):
+    """A class of messages as ROS defines them: fields with the makers of their first values; no others."""
+    made = [(field, object, dataclasses.field(default_factory=first)) for field, first in fields.items()]
+    return dataclasses.make_dataclass(name, made, slots=True)
+
+
+Header = message("Header", stamp=lambda: None, frame_id=str)
+Vector3 = message("Vector3", x=float, y=float, z=float)
+Wrench = message("Wrench", force=Vector3, torque=Vector3)
+MultiArrayDimension = message("MultiArrayDimension", label=str, size=int, stride=int)
+MultiArrayLayout = message("MultiArrayLayout", dim=list, data_offset=int)
+PACKAGES = {
+    "geometry_msgs.msg": [message("WrenchStamped", header=Header, wrench=Wrench)],
+    "sensor_msgs.msg": [message("JointState", header=Header, name=list, position=list, velocity=list, effort=list)],
+    "std_msgs.msg": [
+        message("Float32MultiArray", layout=MultiArrayLayout, data=list),
+        message("Float64MultiArray", layout=MultiArrayLayout, data=list),
+        MultiArrayDimension,
+    ],
+    "std_srvs.srv": [message("SetBool")],
+}
+
+
+class Node:
+    """A node without a middleware. `topics` has the published messages by topic."""
+
+    def __init__(self, name, **parameters):
+        self.name, self.parameters = name, parameters
+        self.topics, self.subscriptions, self.services, self.timers, self.said = {}, {}, {}, [], []
+
+    def declare_parameter(self, name, default):
+        return SimpleNamespace(value=self.parameters.get(name, default))
+
+    def create_publisher(self, kind, topic, depth):
+        kept = self.topics.setdefault(topic, [])
+
+        def publish(given):
+            assert type(given) is kind
+            kept.append(given)
+
+        return SimpleNamespace(publish=publish)
+
+    def create_subscription(self, kind, topic, call, depth):
+        self.subscriptions[topic] = kind, call
+
+    def create_service(self, kind, name, call):
+        self.services[name] = call
+
+    def create_timer(self, period, call):
+        self.timers.append((period, call))
+
+    def get_logger(self):
+        return SimpleNamespace(info=self.said.append, error=self.said.append)
+
+    def get_clock(self):
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
+    def destroy_node(self):
+        self.said.append("destroyed")
+
+
+def install(patch, node, spin):
+    """Put the modules in place for as long as a `pytest.MonkeyPatch` lasts; `rclpy.spin` is `spin`."""
+    for name, classes in PACKAGES.items():
+        package, _, _ = name.partition(".")
+        module = types.ModuleType(name)
+        vars(module).update({kind.__name__: kind for kind in classes})
+        patch.setitem(sys.modules, package, types.ModuleType(package))
+        patch.setitem(sys.modules, name, module)
+    rclpy = types.ModuleType("rclpy")
+    rclpy.init = rclpy.try_shutdown = lambda: None
+    rclpy.create_node = lambda name: node
+    rclpy.spin = spin
+    patch.setitem(sys.modules, "rclpy", rclpy)
 
 
 def follower(hand, measures=("currents", "taxels")):
@@ -31,8 +109,8 @@ def make(monkeypatch, leap):
     def make(driver, options="--no-guard"):
         monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
         given = {"port": "sdk:my_sdk", "hand": "leap_like", "options": options}
-        node = rclpy_stand_in.Node("dexsim_hand", **given)
-        rclpy_stand_in.install(monkeypatch, node, lambda node: None)
+        node = Node("dexsim_hand", **given)
+        install(monkeypatch, node, lambda node: None)
         now = [0.0]
         hand = ros.HandNode(node)
         hand.loop.clock = hand.port._clock = lambda: now[0]
@@ -121,7 +199,7 @@ def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
     """The command itself, with its thread."""
     driver = follower(leap)
     monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
-    node = rclpy_stand_in.Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard --safety.stale 2")
+    node = Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard --safety.stale 2")
 
     def spin(node):
         node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
@@ -129,7 +207,7 @@ def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
             time.sleep(0.01)
         raise way("the end")
 
-    rclpy_stand_in.install(monkeypatch, node, spin)
+    install(monkeypatch, node, spin)
     monkeypatch.setattr(ros, "prepare_jax", lambda: None)
     with pytest.raises(way):
         ros.main()

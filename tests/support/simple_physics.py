@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.physics.interface import PhysicsState, StepResult
 
-ARMATURE = 5e-4  # kg m^2, of every joint
+INERTIA = 1e-3  # kg m^2, of every joint
 
 
 class SimplePhysics:
@@ -19,14 +19,7 @@ class SimplePhysics:
         self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
         del options
-        self.inertia = 5e-4 + ARMATURE
-        self.mj_model = SimpleNamespace(
-            nv=18,
-            dof_M0=np.full(18, self.inertia),
-            dof_armature=np.full(18, ARMATURE),
-            dof_invweight0=np.full(18, 1 / self.inertia),
-            opt=SimpleNamespace(timestep=config.timestep),
-        )
+        self.mj_model = SimpleNamespace(nv=18, dof_M0=np.full(18, INERTIA))
 
     def tip_stiffness(self, object, pose, position, rotation, skin_force, pad_thickness_delta=0.0):
         return jnp.ones(5)
@@ -37,13 +30,9 @@ class SimplePhysics:
         def substep(carry, index):
             qpos, qvel = carry
             tau = law(index, qpos[:12], qvel[:12])
-            speed = qvel[:12] + self.config.timestep / self.inertia * (tau - 0.02 * qvel[:12])
-            fall = qvel[12:15] + self.config.timestep * (jnp.array([9.81, 0, 0]) + push / object.mass)
-            qvel = jnp.concatenate([speed, fall, qvel[15:]])
-            moved = jnp.concatenate(
-                [qpos[:12] + self.config.timestep * speed, qpos[12:15] + self.config.timestep * fall, qpos[15:]]
-            )
-            return (moved, qvel), None
+            motors, fall = (tau - 0.02 * qvel[:12]) / INERTIA, jnp.array([9.81, 0, 0]) + push / object.mass
+            qvel = qvel.at[:15].add(self.config.timestep * jnp.concatenate([motors, fall]))
+            return (qpos.at[:15].add(self.config.timestep * qvel[:15]), qvel), None
 
         steps = jnp.arange(self.config.substeps)
         (qpos, qvel), _ = jax.lax.scan(substep, (state.qpos, state.qvel), steps)

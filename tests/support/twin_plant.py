@@ -58,8 +58,3 @@ class ScriptedPlant:
 
     def results(self):
         return [{"trial": k} for k in range(self.trial + 1)]
-
-
-def make(arguments, hand):
-    """In place of `dexsim_real.twin.__main__.make_plant`."""
-    return ScriptedPlant(arguments.seconds or math.inf)

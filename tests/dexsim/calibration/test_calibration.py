@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from virtual_press import Motor, press
 
 from dexsim.calibration import maps
 from dexsim.calibration.fit import JointPress, calibrate, find_swings, fit_joint, fit_line
@@ -67,15 +66,40 @@ def test_what_differs_between_presses_widens_the_intervals():
 
 # --- a motor of known truth --------------------------------------------------------------------
 
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """Nm/A, shares and A, of the joint; the reading is off by `bias` and has `noise`."""
+
+    torque_constant: float
+    efficiency: float = 1.0
+    back_efficiency: float = 1.0
+    no_load_current: float = 0.0
+    ripple: float = 0.0
+    ripple_phase: float = 0.0
+    bias: float = 0.0
+    noise: float = 0.0
+
+
 MOTOR = Motor(
     torque_constant=0.9, efficiency=0.8, back_efficiency=0.7, no_load_current=0.02, ripple=0.02, bias=0.004, noise=0.004
 )
-LEVER = 0.06
+LEVER = 0.06  # m
 
 
-def recording(seed=0, motor=MOTOR, **options):
-    options = {"lever": LEVER, "force_noise": 0.03, **options}
-    return press(motor, seed, **options)
+def recording(seed=0, motor=MOTOR, *, force_noise=0.03):
+    """Press slowly, three times up and down, to 8 N while the joint yields by 0.05 rad, 300 ripples/rad; steps of 1 mA.
+
+    Motoring, the motor must give torque / efficiency; driven back, only torque * back_efficiency holds it. On top comes
+    the current that it draws without load, in the direction of motion.
+    """
+    rng, phase = np.random.default_rng(seed), np.arange(600) / 200 % 1.0
+    share, way = 1.0 - np.abs(2.0 * phase - 1.0), np.where(phase < 0.5, 1.0, -1.0)  # up and down again
+    force, loss = 8.0 * share, np.where(way > 0, 1.0 / motor.efficiency, motor.back_efficiency)
+    ripple = 1.0 + motor.ripple * np.sin(300 * 0.05 * share + motor.ripple_phase)
+    current = LEVER * force / (motor.torque_constant * ripple) * loss + motor.no_load_current * way
+    current = np.round(current + motor.bias + motor.noise * rng.standard_normal(600), 3)
+    return JointPress(np.maximum(force + force_noise * rng.standard_normal(600), 0.0), current)
 
 
 def test_both_lines_of_a_motor_with_losses():
@@ -317,14 +341,3 @@ def test_a_damaged_file_is_refused(hand, sound, tmp_path, old, new, says):
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
     assert re.search(says, refused(path, hand))
-
-
-def test_force_per_torque_reaches_the_hand(hand, sound, tmp_path):
-    maps.save_calibration(tmp_path / "c.toml", sound)
-    calibration = maps.load_calibration(tmp_path / "c.toml", hand)
-    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
-    expected = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
-    np.testing.assert_allclose(maps.calibrated_hand(hand, calibration).force_per_torque, expected)
-    assert (
-        maps.calibrated_hand(hand, maps.blank_calibration(hand)) is hand is maps.calibrated_hand(hand, None)
-    )  # Nothing was pressed.

@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 from episodes import by_field, ground_truth
+from random_readings import random_readings
 from scipy.spatial.transform import Rotation
 
 from dexsim import observation
 from dexsim.env.sensors import SensorSuite
-from dexsim.observation import Readings
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import revert_if_diverged
 
@@ -32,14 +32,11 @@ def observer(grasp_env):
 def seen(grasp_env, observer):
     """The object's velocity and spin as a task sees them, and the critic's observation, from a physics state."""
     object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], grasp_env.pool.object)
-    upright, joints, nothing = jnp.array([1.0, 0, 0, 0]), jnp.zeros(12), jnp.zeros(3)
-    readings = Readings(
-        joints, joints, jnp.zeros((5, 120)), nothing, nothing, upright, upright, jnp.float32(0.5), joints
-    )
+    readings = random_readings(grasp_env.hand, 0)
 
     def look(physics):
         truth = ground_truth(grasp_env, object, physics, jnp.zeros((5, 3)))
-        critic = observer.observe(readings, truth, (jnp.float32(0.5), upright))["critic"]
+        critic = observer.observe(readings, truth, (readings.command, readings.goal_quat))["critic"]
         return (truth.object_velocity, truth.object_spin), critic
 
     return jax.jit(look)

@@ -15,7 +15,6 @@ from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.sensing.imu import ImuConfig, ImuParams
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
-from dexsim_real.sensors import imu
 
 QUIET = Sensing(
     joint_noise=0.0,
@@ -126,12 +125,3 @@ def test_gravity_in_the_palm_frame_has_the_mounts_lean_and_the_alignments_error(
     bias = np.array([0.02, -0.03, 0.01])
     expected = Rotation.from_rotvec(bias).apply(level)
     np.testing.assert_allclose(read(QUIET, now, bias=bias).palm_gravity, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_bridges_imu_tells_gravity_in_the_palm_frame(seed):
-    """`palm` turns the palm frame into the IMU's world, whose z is up."""
-    palm, reader = Rotation.random(random_state=seed), imu.ImuReader()
-    reader._newest = 0.0, imu.multiply(np.roll(palm.as_quat(), 1), reader._mount)
-    reader.calibrate(imu.IDENTITY)
-    np.testing.assert_allclose(reader.palm_gravity, palm.inv().apply([0.0, 0.0, -1.0]), atol=1e-6)

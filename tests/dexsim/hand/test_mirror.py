@@ -26,11 +26,6 @@ from dexsim.observation import GRASP, ROTATE_CRITIC, Motion, ObservationConfig, 
 HANDS = ("xhand_right", "leap_like", "inspire_like")
 
 
-@pytest.fixture(scope="module")
-def left():
-    return load_hand("xhand_left")
-
-
 def same(one: Hand, other: Hand, *apart: str) -> None:
     """Whether two hands agree in all that is a number."""
     for field in dataclasses.fields(Hand):

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.compilation import jit
@@ -100,8 +99,7 @@ def test_sizes_masses_and_inertia_drawn_are_of_the_solid(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
-def test_taxels_feel_the_mesh_at_the_size_of_the_episode(monkeypatch, folder, method):
-    monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
+def test_taxels_feel_the_mesh_at_the_size_of_the_episode(folder, method):
     objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="c")
     targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.object)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from c_scene import GRAVITY, row, rows_of, squeeze, stack
 from paths import ROOT
+from tiny_env import assert_same
 
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import c_backend, model as scene_model
@@ -65,11 +66,6 @@ def batch_of(grips):
     starts, _, qpos, qvel, warmstart, torque = zip(*grips, strict=True)
     state = PhysicsState(*(np.stack(x) for x in (qpos, qvel, warmstart)))
     return stack([start.object for start in starts]), state, np.stack(torque)
-
-
-def assert_same(first, second):
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
-        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
 class TestForces:

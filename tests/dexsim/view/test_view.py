@@ -34,13 +34,6 @@ class Gui(dict):
     add_slider = add_dropdown = add_button = add
 
 
-def open_with_controls(**arguments):
-    """A source and its controls."""
-    source, gui = open_source(ViewArguments(**arguments)), Gui()
-    source.add_controls(gui)
-    return source, gui
-
-
 # --- what is drawn --------------------------------------------------------------------------------------
 
 
@@ -132,7 +125,8 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
 def test_the_emulated_hand_is_a_source(hand, monkeypatch):
     # The flags that other tests compile with stay as they are.
     monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
-    source, gui = open_with_controls(what="rotate", emulated=True)
+    source, gui = open_source(ViewArguments(what="rotate", emulated=True)), Gui()
+    source.add_controls(gui)
     assert not gui
     frames = list(itertools.islice(source.episode(), 31))
     snapshot = frames[-1].snapshot
@@ -141,27 +135,6 @@ def test_the_emulated_hand_is_a_source(hand, monkeypatch):
     moved = np.ptp([frame.snapshot.joint_position for frame in frames], 0)
     assert moved.max() > 0.1 and np.all(snapshot.joint_position > hand.joint_lower - 0.1)
     assert next(source.episode()).note == "trial 1"
-
-
-def test_a_log_is_a_source(tmp_path, monkeypatch):
-    pytest.importorskip("serial")
-    monkeypatch.setattr("dexsim_real.run.prepare_jax", lambda: None)
-    from following_hand import FollowingHand, arguments, records
-
-    from dexsim_real import run as runner
-    from dexsim_real.core.log import Kind
-
-    with FollowingHand() as peer:
-        assert runner.main(arguments(peer, tmp_path, "--seconds", "0.6")) == 0
-    ticks = records(tmp_path, Kind.TICK)
-    source, gui = open_with_controls(what=str(tmp_path / "run.log"))
-    frames = list(source.episode())
-    for frame, tick in zip(frames, ticks, strict=True):
-        np.testing.assert_array_equal(frame.snapshot.joint_position, tick["readings"]["joint_position"])
-    assert frames[0].kinds == () and gui["go to [s]"].max == pytest.approx(0.6, abs=0.2)
-    gui["go to [s]"].value = 0.3
-    late = next(source.episode()).snapshot
-    assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
 
 
 # Everything that the base install leaves out is absent.

@@ -6,17 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import SHORT, TinyEnv
 
 pytest.importorskip("brax")
 
 
 from dexsim.wrappers.brax import BraxEnv, wrap
-
-
-def tiny():
-    """A point that is off the field after three ticks of full action; its time limit is 6 ticks."""
-    return TinyEnv(TinyConfig(horizon=6, gain=1.0, wall=1.5))
 
 
 def keys(count):
@@ -34,18 +29,11 @@ def run(env, actions):
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 
-def test_step_is_ours():
-    ours, env = tiny(), BraxEnv(tiny())
-    state, want = env.reset(jax.random.PRNGKey(3)), ours.reset(jax.random.key(3))
-    for _ in range(4):
-        state, want = env.step(state, 0.1 * jnp.ones(1)), ours.step(want, 0.1 * jnp.ones(1))
-    np.testing.assert_array_equal(state.obs["critic"], want.obs["critic"])
-    np.testing.assert_array_equal(state.reward, want.reward)
-
-
-def test_terminated_and_truncated_apart():
+def test_rewards_are_ours_and_terminated_and_truncated_apart():
     # The first environment runs off the field, the second stays on it until the time limit.
-    states = run(wrap(BraxEnv(tiny()), episode_length=100), jnp.array([[1.0], [0.0]]))
+    states = run(wrap(BraxEnv(TinyEnv(SHORT)), episode_length=100), jnp.array([[1.0], [0.0]]))
+    x, target, _ = states.obs["critic"][:5, 1].T  # of an integrator that does not move
+    np.testing.assert_allclose([x, states.reward[:5, 1]], [x[:1].repeat(5), 1 - np.abs(x - target)], rtol=1e-6)
     done, truncation = states.done.astype(bool), states.info["truncation"].astype(bool)
     ran_off, stayed = np.flatnonzero(done[:, 0]), np.flatnonzero(done[:, 1])
     assert len(ran_off) >= 2 and not truncation[:, 0].any()
@@ -63,5 +51,7 @@ def test_its_ppo_runs():
 
     factory = functools.partial(networks.make_ppo_networks, policy_obs_key="actor", value_obs_key="critic")
     sizes = dict(num_timesteps=96, episode_length=8, num_envs=8, batch_size=4, num_minibatches=2, unroll_length=4)
-    _, params, _ = ppo.train(BraxEnv(tiny()), wrap_env_fn=wrap, network_factory=factory, run_evals=False, **sizes)
+    _, params, _ = ppo.train(
+        BraxEnv(TinyEnv(SHORT)), wrap_env_fn=wrap, network_factory=factory, run_evals=False, **sizes
+    )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))

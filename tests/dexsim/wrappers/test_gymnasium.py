@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import SHORT, TinyEnv
 
 pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env
@@ -14,49 +14,38 @@ from dexsim.wrappers.gymnasium import GymEnv, GymVectorEnv
 NEXT_STEP = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
 
-def test_it_steps_as_the_environment_does():
+def test_it_steps_as_the_environment_does_and_restarts_in_the_same_step():
+    """Where an episode has ended its last observation is kept, and what is seen is that of a new one."""
     ours, env = TinyEnv(), GymVectorEnv(TinyEnv(), 4)
     seen, info = env.reset(seed=3)
     assert info == {} and env.observation_space.contains(seen) and seen.dtype == np.float32
-    state = jax.vmap(lambda seed: ours.reset(jax.random.key(seed)))(np.arange(3, 7))
-    np.testing.assert_array_equal(seen, state.obs["actor"])
+    np.testing.assert_array_equal(
+        seen, jax.vmap(lambda seed: ours.reset(jax.random.key(seed)))(np.arange(3, 7)).obs["actor"]
+    )
     env.action_space.seed(0)
-    step = jax.jit(jax.vmap(ours.step))
-    for _ in range(5):
+    step, done = jax.jit(jax.vmap(ours.step)), np.zeros(4, bool)
+    while not done.any():
+        assert info == {}
         action = env.action_space.sample()
-        state = step(state, action)
+        last = step(env._state, action)
         seen, reward, terminated, truncated, info = env.step(action)
-        np.testing.assert_allclose(seen, state.obs["actor"], rtol=1e-6)
-        np.testing.assert_allclose(reward, state.reward, rtol=1e-6)
-        assert not (terminated | truncated).any() and info == {}
-
-
-def test_a_finished_episode_restarts_in_the_same_step_and_leaves_its_last_observation():
-    ours, env = TinyEnv(), GymVectorEnv(TinyEnv(), 3)
-    env.reset(seed=0)
-    before, step = env._state, jax.jit(jax.vmap(ours.step))
-    for _ in range(200):
-        action = np.zeros(env.action_space.shape, np.float32)
-        state = step(before, action)
-        seen, _, terminated, truncated, info = env.step(action)
-        before = env._state
-        if (terminated | truncated).any():
-            break
-    done = terminated | truncated
+        np.testing.assert_allclose(reward, last.reward, rtol=1e-6)
+        np.testing.assert_array_equal([terminated, truncated], [last.terminated, last.truncated])
+        done = terminated | truncated
+        np.testing.assert_allclose(seen[~done], last.obs["actor"][~done], rtol=1e-6)
     np.testing.assert_array_equal(info["_final_obs"], done)
-    np.testing.assert_allclose(info["final_obs"][done], np.asarray(state.obs["actor"])[done], rtol=1e-6)
-    assert np.any(seen[done] != info["final_obs"][done]), "the observation is that of a new episode"
-    np.testing.assert_allclose(np.asarray(env._state.metrics["length"])[done], 0)
-    np.testing.assert_allclose(info["final_info"]["return"][done], np.asarray(state.metrics["return"])[done], rtol=1e-6)
+    np.testing.assert_allclose(info["final_obs"][done], last.obs["actor"][done], rtol=1e-6)
+    assert np.any(seen[done] != info["final_obs"][done])
+    np.testing.assert_allclose(env._state.metrics["length"][done], 0)
+    np.testing.assert_allclose(info["final_info"]["return"][done], last.metrics["return"][done], rtol=1e-6)
 
 
 def test_a_finished_episode_restarts_in_the_next_step_as_gymnasiums_own_vector_environment_has_it():
     """Against `SyncVectorEnv` of single environments: the same ends, rewards and, up to the first restart, states."""
     from gymnasium.vector import SyncVectorEnv
 
-    config = TinyConfig(horizon=6, gain=1.0, wall=1.5)
-    ours = GymVectorEnv(TinyEnv(config), 2, **NEXT_STEP)
-    theirs = SyncVectorEnv([lambda: GymEnv(TinyEnv(config))] * 2)
+    ours = GymVectorEnv(TinyEnv(SHORT), 2, **NEXT_STEP)
+    theirs = SyncVectorEnv([lambda: GymEnv(TinyEnv(SHORT))] * 2)
     assert theirs.metadata["autoreset_mode"] == ours.metadata["autoreset_mode"]
     (seen, _), (expected, _) = ours.reset(seed=7), theirs.reset(seed=7)
     np.testing.assert_allclose(seen, expected, rtol=1e-6)

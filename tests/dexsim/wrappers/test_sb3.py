@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import SHORT, TinyEnv
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +17,7 @@ def test_an_end_has_its_last_observation_and_tells_a_time_limit_from_a_terminati
     from dexsim.wrappers.sb3 import SB3VecEnv
 
     # The first environment runs off the field, the second stays on it until the time limit.
-    env = VecMonitor(SB3VecEnv(TinyEnv(TinyConfig(horizon=6, gain=1.0, wall=1.5)), 2))
+    env = VecMonitor(SB3VecEnv(TinyEnv(SHORT), 2))
     env.seed(5)
     first = env.reset()
     env.seed(5)

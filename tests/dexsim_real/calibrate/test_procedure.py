@@ -16,7 +16,6 @@ from calibrating import QUICK, SHORT, Typist, arguments, off, on, operator, plat
 from press_bench import BenchHand
 
 from dexsim.calibration.maps import save_calibration, torque_constants
-from dexsim.hand.load import load_hand
 from dexsim_real.calibrate.bench import Bench, Operator, PressConfig, parse_reading
 from dexsim_real.calibrate.press_fit import fit, read_presses
 from dexsim_real.calibrate.procedure import PressProcedure, placements
@@ -52,8 +51,8 @@ def test_every_joint_is_pressed_with_and_every_press_goes_outward(hand):
         placements(hand, ("toe",))
 
 
-def test_the_left_hand_is_calibrated_by_the_same_presses(hand):
-    for one, other in zip(placements(hand), placements(load_hand("xhand_left")), strict=True):
+def test_the_left_hand_is_calibrated_by_the_same_presses(hand, left):
+    for one, other in zip(placements(hand), placements(left), strict=True):
         assert (one.name, one.joints, one.task) == (other.name, other.joints, other.task)
         np.testing.assert_array_equal(other.posture, one.posture)
         np.testing.assert_allclose(other.direction, one.direction, atol=1e-5)

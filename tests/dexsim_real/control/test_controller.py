@@ -4,13 +4,12 @@ import math
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import still_moment
 from test_safety import CYCLE, MIDDLE, Bench
 
 from dexsim.env.sensors import SensorSuite
-from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec, TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
@@ -62,21 +61,12 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
     # The simulation's door: `SensorSuite.observe`, compiled by itself, on readings and some truth for the critic.
     sensors = SensorSuite(config, hand, task)
 
-    def door(readings, goal):
-        moment = SimpleNamespace(
-            **dict.fromkeys(("joint_torque", "joint_velocity", "action"), jnp.zeros(12)),
-            joint_position=readings.joint_position,
-            pose=forward_kinematics(hand, readings.joint_position),
-            touch=SimpleNamespace(force=readings.taxel_force),
-            object_position=readings.object_position,
-            object_velocity=readings.object_velocity,
-            object_quat=readings.object_quat,
-            object_spin=jnp.zeros(3),
-        )
-        command, goal_quat = task.goal_readings(goal)
-        return sensors.observe(readings, moment, (command, goal_quat))["actor"]
+    truth = still_moment(hand, np.zeros(3))
 
-    door = jax.jit(door)
+    @jax.jit
+    def door(readings, goal):
+        return sensors.observe(readings, truth, task.goal_readings(goal))["actor"]
+
     goal = task.begin(jax.random.key(0), None)
     for _ in range(20):
         quats = rng.normal(size=(2, 4))

@@ -12,18 +12,16 @@ import threading
 import time
 from types import SimpleNamespace
 
-import memory_line
 import numpy as np
 import pytest
 from following_hand import FollowingHand, arguments, records, summary
+from pty_hand import connect_in_memory
 from rich.console import Console
 from scripted_driver import ScriptedDriver
 
 import dexsim_real
 from dexsim.calibration.maps import save_calibration
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
-from dexsim.hand.source import recorded_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real import replay, run
 from dexsim_real.control.controller import Controller, limits_for
@@ -154,7 +152,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path, monkeypatch)
         return bytes(whole)
 
     with FollowingHand(trouble) as peer:
-        memory_line.connect(monkeypatch, peer)
+        connect_in_memory(monkeypatch, peer)
         assert run.main(arguments(peer, tmp_path, "--seconds", "1.5", "--link.margin", "0.06")) == 0
         sent = np.array([block["position"] for block in peer.commands])[peer.on()]
     assert np.all(sent >= hand.joint_lower - 1e-6) and np.all(sent <= hand.joint_upper + 1e-6)
@@ -235,16 +233,6 @@ def test_a_run_ends_when_its_exchange_thread_has_failed():
     parts = SimpleNamespace(loop=SimpleNamespace(check=fail), safety=SimpleNamespace(latched=""))
     with pytest.raises(HandError, match="the exchange thread failed"):
         run.Session._check(parts)
-
-
-def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
-    """A policy's file may be anybody's: of the files here it may name the TOML of a hand."""
-    monkeypatch.setattr("dexsim.hand.source.load_hand", lambda *_: pytest.fail("it was opened"))
-    (tmp_path / "secret").write_text("a = 1")
-    record = {"digest": "", "joints": [], "fingers": [], "taxels": 1}
-    for file in (tmp_path / "secret", tmp_path, tmp_path / "none.toml", "/dev/zero"):
-        with pytest.raises(ConfigError, match="is missing: give --hand FILE"):
-            recorded_hand(record | {"file": str(file)}, None, "policy.msgpack")
 
 
 def test_a_hand_that_was_gone_for_most_of_the_run_and_actions_that_are_not_finite(tmp_path, capsys, monkeypatch):

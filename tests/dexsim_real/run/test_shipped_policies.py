@@ -2,7 +2,6 @@
 
 import pytest
 
-from dexsim.hand.load import load_hand
 from dexsim_ppo.policy import load_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.virtual import VirtualRun
@@ -34,8 +33,8 @@ def test_the_grasp_holds_and_presses_as_asked(trial):
     assert strong["finger_force"] > weak["finger_force"] + 1.5, (weak["finger_force"], strong["finger_force"])
 
 
-def test_the_shipped_grasp_of_the_right_hand_holds_on_the_left_one(trial):
-    report = trial("grasp", 1.5, hand=load_hand("xhand_left"))
+def test_the_shipped_grasp_of_the_right_hand_holds_on_the_left_one(trial, left):
+    report = trial("grasp", 1.5, hand=left)
     assert report["held"] and report["finger_force"] > 0.5
 
 

@@ -113,13 +113,15 @@ def turns(most):
 
 @given(turns(3.0), turns(3.0), turns(0.1))
 def test_one_known_pose_aligns_all_three_angles(world, first, turn):
-    """Whatever the palm's lean and the IMU's heading: a turn is measured as it is in the palm frame."""
+    """Whatever the palm's lean and the IMU's heading: a turn is measured as it is in the palm frame, and so is gravity.
+    `world` turns the IMU's world, whose z is up, into the palm frame."""
     reader, mount = imu.ImuReader(), Rotation.from_quat(np.roll(imu.UPRIGHT_X, -1))
     for index, pose in enumerate((first, turn * first)):
         reader.receive(0.01 * index, imu.encode(index, np.roll((world.inv() * pose * mount).as_quat(), 1)))
         if index == 0:
             reader.calibrate(np.roll(pose.as_quat(), 1))
     assert apart(reader.read()[1], np.roll((turn * first).as_quat(), 1)) < 4e-3
+    np.testing.assert_allclose(reader.palm_gravity, world.apply([0.0, 0.0, -1.0]), atol=4e-3)
 
 
 def test_an_imu_that_hangs_is_silent_and_a_jump_is_no_orientation():

@@ -12,7 +12,6 @@ from hypothesis import given, strategies as st
 pytest.importorskip("serial")
 from twin_plant import REST, ScriptedPlant
 
-from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.emulated_hand import PlantMeasurement
 from dexsim_real.twin.wire import OVERHEATED, SERIALS, Firmware, HandLine, Terminal
@@ -83,8 +82,8 @@ def test_a_motor_that_is_too_hot_goes_off_until_it_has_cooled():
         assert state["joint_error"].tolist() == [OVERHEATED if hot and joint == 4 else 0 for joint in range(12)]
 
 
-def test_each_hand_tells_its_side_and_serial_number(hand):
-    for one in (hand, load_hand("xhand_left")):
+def test_each_hand_tells_its_side_and_serial_number(hand, left):
+    for one in (hand, left):
         board = Firmware(SimpleNamespace(hand=one))
         registers = (register.to_bytes(2, "little") for register in (SERIAL_NUMBER, SIDE))
         told = read_identity(*(ask(board, Command.READ_REGISTER, name).data[2:] for name in registers))

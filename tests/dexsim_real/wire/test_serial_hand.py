@@ -6,11 +6,10 @@ import re
 import termios
 import time
 
-import memory_line
 import numpy as np
 import pytest
 from emulated_plant import motors
-from pty_hand import QUICK, PtyHand
+from pty_hand import QUICK, Clock, PtyHand, connect_in_memory
 
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
@@ -29,8 +28,8 @@ serial = pytest.importorskip("serial")
 
 def memory_port(monkeypatch, peer, config=QUICK):
     """A port to this hand over a line in memory, and the clock of both."""
-    clock = memory_line.Clock()
-    memory_line.connect(monkeypatch, peer, clock)
+    clock = Clock()
+    connect_in_memory(monkeypatch, peer, clock)
     port = SerialHand("loop://", config)
     port._open()
     return port, clock
@@ -176,7 +175,7 @@ def test_answers_that_come_too_soon_or_too_late_are_told(monkeypatch):
     for version, delay in ((b"1", 0.0), (None, 0.113), (None, 0.15)):
         peer = PtyHand(version=version)
         peer.delay = delay
-        memory_line.connect(monkeypatch, peer, memory_line.Clock())
+        connect_in_memory(monkeypatch, peer, Clock())
         with pytest.raises(HandError, match="too late; raise --link.margin.*--link.no-paced"):
             SerialHand("loop://", dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)).connect()
 
