@@ -20,21 +20,21 @@ from dexsim_ppo.training.trainer import initialize_from
 
 @pytest.fixture(scope="module")
 def trained():
-    """The state after 80 iterations, and the mean return of each ten."""
+    """The state after 150 iterations, and the mean return of each ten."""
     training = training_of(CONFIG)
     state, returns = training.init(jax.random.key(0)), []
-    for _ in range(8):
+    for _ in range(15):
         state, metrics = training.step(state)
         returns.append(float(jnp.nanmean(metrics["episode/return"])))
     return state, returns
 
 
 def test_reaches_the_known_return(trained):
-    """29 of the best possible 31.2 with exploration on."""
+    """29 of the best possible 31.2 after 80 iterations, with exploration on."""
     state, returns = trained
-    assert returns[-1] > 29.0 and returns[0] < 25.0, returns
+    assert returns[7] > 29.0 and returns[0] < 25.0, returns
     assert int(state.skipped_updates) == 0
-    assert int(state.iteration) == 80
+    assert int(state.iteration) == 150
 
 
 def test_a_good_policy_is_not_worse_in_another_world(trained):
