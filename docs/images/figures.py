@@ -30,7 +30,16 @@ from dexsim_ppo import evaluate, load_policy
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES, RESULTS = ROOT / "docs" / "images", ROOT / "docs" / "results"
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests" / "support")]  # `paper`; the bench of the presses
-FILMS = {"grasp": 8, "rotate": 20, "rotate_without_orientation": 20, "rotate_clear": 10}  # s of each episode
+FILMS: dict[str, tuple[Any, ...]] = {  # policy, s of each episode, and settings of the task
+    "grasp": ("grasp", 8),
+    "rotate": ("rotate", 20),
+    "rotate_without_orientation": ("rotate_without_orientation", 20),
+    "rotate_any": (
+        *("rotate_without_orientation", 20, "edge=[0.045,0.065]", "proportions=[0.9,1.1]"),
+        "randomization.gravity_tilt=0.4",  # Boxes alone: nobody sees a cylinder turn.
+    ),
+    "rotate_clear": ("rotate_clear", 10),
+}
 
 
 def animation() -> None:
@@ -41,11 +50,11 @@ def animation() -> None:
 
 
 def films() -> None:
-    """A film of each shipped policy."""
-    for name, seconds in FILMS.items():
+    """A film of each shipped policy, and one of `rotate_any`'s objects."""
+    for name, (policy, seconds, *settings) in FILMS.items():
         print(f"film of {name}", flush=True)
-        options = ["--episodes", "64", "--no-baseline", "--seconds", f"{seconds}"]
-        evaluate.main([name, *options, "--video", str(IMAGES / f"{name}.mp4")])
+        options = ["--episodes", "64", "--no-baseline", "--seconds", f"{seconds}", "--set", *settings]
+        evaluate.main([policy, *options, "--video", str(IMAGES / f"{name}.mp4")])
 
 
 def view() -> None:
