@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, rewritten, summary
+from pty_hand import connect_in_memory
 
 from dexsim.core.errors import DexsimError
 from dexsim.view.__main__ import ViewArguments, open_source
@@ -19,10 +20,10 @@ from dexsim_real.core.log import Kind, LogError
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
 
-def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_path):
+def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_path, monkeypatch):
     with FollowingHand() as peer:
-        patient = ("--link.margin", "0.5")  # on a busy machine an answer takes longer than 0.1 s
-        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6", *patient)) == 0
+        connect_in_memory(monkeypatch, peer)  # No answer is late, however busy the machine is.
+        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6")) == 0
         on, commands = peer.on(), peer.commands
     first = int(np.argmax(on))
     # Off while zeroing and warming, on at the measured pose, without a break until the end, then off.
@@ -34,17 +35,17 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert np.median(speeds) < 25
     report = summary(tmp_path)
     assert report["end"] == "time is over" and report["command"] == 0.6
-    assert report["policy_jitter"]["count"] == pytest.approx(1.2 * 100 / 3, abs=15)
     # And the version, serial number and side.
     assert report["link"]["sent"] == report["link"]["answered"] == len(commands) + 3
     # Everything is in the log: each frame, and each tick with the answer that it saw.
     assert len(records(tmp_path, Kind.RECEIVED)) == len(records(tmp_path, Kind.SENT)) == len(commands) + 3
     ticks = records(tmp_path, Kind.TICK)
+    assert 5 < report["policy_jitter"]["count"] <= len(ticks) <= 1.2 * 100 / 3 + 2
     assert [tick["readings"]["command"] for tick in ticks] == [np.float32(0.6)] * len(ticks)
     for before, after in zip(ticks[:-1], ticks[1:], strict=True):
         assert after["readings"]["last_action"].tobytes() == before["action"].tobytes()
     again = replay.Replay(tmp_path / "run.log").report
-    assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
+    assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks)
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
     drawn_and_taken_along(hand, tmp_path, ticks)
     shown_in_the_live_view(tmp_path, ticks)
