@@ -98,7 +98,7 @@ class BenchHand(HandPort):
     def sleep(self, seconds):
         self.advance(self.commands[-1] if self.commands else None, seconds)
 
-    def advance(self, command, seconds, step=0.007):
+    def advance(self, command, seconds, step=0.005):
         until = self.time + seconds
         while self.time < until - 1e-9:
             size = min(step, until - self.time)

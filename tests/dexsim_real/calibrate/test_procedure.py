@@ -199,12 +199,11 @@ def test_a_missed_pen_is_pressed_again(hand, pressed, tmp_path, misses, stream):
     assert helper.told == min(misses, 2 if stream is None else 1) and off(pressed) and pressed.closed
 
 
-@pytest.mark.slow
 def test_motors_that_give_no_more_turn_round(hand, pressed, tmp_path):
     """A current limit far below what 8 N need: the press ends where the force ends."""
     hardware = dataclasses.replace(arguments(tmp_path).hardware, torque_max=90)  # 0.45 A on the bench
     press = dataclasses.replace(SHORT, seconds=5.0)
-    log = record(pressed, hand, arguments(tmp_path, hardware=hardware, sides=False, press=press))
+    log = record(pressed, hand, arguments(tmp_path, hardware=hardware, sides=False, press=press, rate=83.0))
     calibration = fit(*read_presses([log], hand), hand)[0]
     # As much as the joint gives by itself, or, pushed by the other one, as much as it holds.
     gives, holds = (
