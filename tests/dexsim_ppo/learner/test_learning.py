@@ -38,7 +38,8 @@ def test_reaches_the_known_return(trained):
 
 
 def test_a_good_policy_is_not_worse_in_another_world(trained):
-    """The return falls when the critic learns at the policy's small rate: the policy climbs its errors."""
+    """The return falls when the critic learns at the policy's small rate: the policy climbs its errors. The policy keeps
+    the normalisation of its observations, which has been trained for: more steps of a GPU would change it wholly."""
     policy = Policy.from_training(TinyEnv(), CONFIG, trained[0])
     config = dataclasses.replace(fine_tuning_config(policy, CONFIG), discount=0.99, critic_first=50)
     start = functools.partial(initialize_from, policy, config)
@@ -48,6 +49,9 @@ def test_a_good_policy_is_not_worse_in_another_world(trained):
         state, metrics = training.step(state)
         returns.append(np.nanmean(metrics["episode/return"]))
     assert np.mean(returns[-5:]) > np.mean(returns[:5]) - 0.5
+    new = Policy.from_training(TinyEnv(), CONFIG, state).params.normalizer
+    np.testing.assert_array_equal(new.mean, policy.params.normalizer.mean)
+    np.testing.assert_allclose(new.std, policy.params.normalizer.std, rtol=1e-6)
 
 
 def test_the_average_is_over_about_the_last_tenth():
