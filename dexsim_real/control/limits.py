@@ -49,5 +49,5 @@ class SafetyConfig(Config):
     off."""
     slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=100.0)
     """Speed of commands once the motors are stiff or a hold ends, at most `speed`, to which it then grows."""
-    ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
+    ramp: float = setting(1.0, unit="s", low=0.01, high=60.0)
     """Time in which the speed of commands grows from `slow_speed` to `speed`."""

@@ -259,7 +259,7 @@ class Safety:
     def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
         config, measured = self.config, sample.measured.joint_position
         # Not below 0, should a clock go back: the speed would become negative.
-        grown = min(max((now - self._ramp_start) / config.ramp, 0.0), 1.0) if config.ramp > 0 else 1.0
+        grown = min(max((now - self._ramp_start) / config.ramp, 0.0), 1.0)
         # Reach ends a motion away from the measured pose and starts none: that pose may be wrong.
         near = (
             np.minimum(measured - config.reach, self.commanded),

@@ -51,6 +51,8 @@ def test_stress_over_hooke(name):
     strain = 1 - np.array(STRETCH, np.float32)
     stress = skin_stress(strain, Skin(**({"c10": 0.0, "c01": 0.0} | {name: 2e4})))
     np.testing.assert_allclose(stress / (6 * 2e4 * strain), RATIO[name], atol=1e-3)
+    hooke = skin_stress(strain, Skin(law="linear", **({"c10": 0.0, "c01": 0.0} | {name: 2e4})))
+    np.testing.assert_allclose(hooke, 6 * 2e4 * strain, rtol=1e-6)
 
 
 def test_flat_punch():
