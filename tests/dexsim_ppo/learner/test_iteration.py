@@ -14,6 +14,7 @@ from dexsim_ppo.learner import running_stats, update
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.loss import Samples
+from dexsim_ppo.learner.networks import init_mlp
 from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments
@@ -208,6 +209,11 @@ def test_memory_fades_over_a_full_count():
 def test_statistics_of_a_column_that_is_not_finite_stay_unchanged():
     stats = merge_moments(init_stats((2,)), jnp.array([2.0, jnp.nan]), jnp.array([1.0, jnp.nan]), 2)
     np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
+
+
+def test_hidden_kernels_are_orthogonal_of_gain_sqrt_2():
+    kernel = init_mlp(jax.random.key(0), (8, 16, 4), 1.0)[0].kernel
+    np.testing.assert_allclose(kernel @ kernel.T, 2 * np.eye(8), atol=1e-5)
 
 
 def test_adam_against_numpy():

@@ -38,8 +38,8 @@ def test_reaches_the_known_return(trained):
 
 
 def test_a_good_policy_is_not_worse_in_another_world(trained):
-    """The return falls when the critic learns at the policy's small rate: the policy climbs its errors. The policy keeps
-    the normalisation of its observations, which has been trained for: more steps of a GPU would change it wholly."""
+    """The return falls when the critic learns at the policy's small rate: the policy climbs its errors. Observations
+    keep their normalisation, which many steps of a GPU would change wholly."""
     policy = Policy.from_training(TinyEnv(), CONFIG, trained[0])
     config = dataclasses.replace(fine_tuning_config(policy, CONFIG), discount=0.99, critic_first=50)
     start = functools.partial(initialize_from, policy, config)

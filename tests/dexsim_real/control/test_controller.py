@@ -155,6 +155,16 @@ def test_a_silent_imu_is_held_within_a_third_of_a_second_then_relaxed(hand, sile
         assert not held and not bench.safety.latched
 
 
+def test_the_approach_eases_from_the_pose_to_the_posture_in_its_time(hand):
+    controller, targets = Still(hand), []
+    controller.spec.posture = np.ones(12)
+    safety = SimpleNamespace(commanded=np.zeros(12), set_target=lambda target, now: targets.append(target))
+    objects = ObjectSensors(np.zeros(3), (0.0, 0.0, -9.81), None, None)
+    loop = PolicyLoop(controller, safety, objects, command=0.5, approach_seconds=2.0, place_seconds=0.0)
+    assert [loop.approach(5.0 + time) for time in (0.0, 0.5, 1.0, 1.5, 2.0)] == [True] * 4 + [False]
+    np.testing.assert_allclose(targets, np.outer([0.0, 0.15625, 0.5, 0.84375], np.ones(12)), rtol=1e-6)  # 3 s^2 - 2 s^3
+
+
 # --- goals of the rotation task ----------------------------------------------------------------------
 
 REFERENCE = (0.047, 0.024, 0.088)
