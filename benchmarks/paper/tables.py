@@ -184,7 +184,7 @@ def _object(name: str, row: dict[str, Any]) -> list[str]:
 
 def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """Success at the measured points of each parameter."""
-    lines = [["sweep", "**value**: grasps held [%] and r of the force, or cubes kept [%] and turns a minute"]]
+    lines = [["sweep", "**value**: grasps held [%] and r of the force, or cubes kept [%] and quarter turns a minute"]]
     for row in experiment.rows:
         points = [point for seed in seeds(reports.get(row.name)) for point in seed["points"]]
         texts = [_point(row.skill)(point) for point in points]
