@@ -56,14 +56,17 @@ class RunFolder:
     def latest_checkpoint(self) -> Path:
         """The newest checkpoint; raises CheckpointError if there is none."""
         if not (paths := self.existing_checkpoints()):
-            raise CheckpointError(f"{self.path}: has no checkpoint to resume from")
+            again = f"; --config {self.path} starts a new run with its options" if self.config.exists() else ""
+            raise CheckpointError(f"{self.path}: has no checkpoint to resume from{again}")
         return paths[-1]
 
     def prune(self, keep: int) -> None:
-        """Delete all but the newest `keep` checkpoints, and their policies."""
+        """Delete all but the newest `keep` checkpoints, and their policies; what a killed process had half written."""
         for path in self.existing_checkpoints()[:-keep]:
-            path.unlink()
             policy_of(path).unlink(missing_ok=True)
+            path.unlink()
+        for path in self.checkpoints.glob(".*.dexsim-part"):
+            path.unlink()
 
     def lock(self) -> contextlib.ExitStack:
         """Keep other processes from training this run, until the result is closed or this process ends. Raises

@@ -10,6 +10,7 @@ import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.errors import CheckpointError
+from dexsim.core.files import temporary_beside
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_metrics
@@ -19,12 +20,14 @@ from dexsim_ppo.training.trainer import Run
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
-    with pytest.raises(CheckpointError, match="has no checkpoint"):
+    folder.config.touch()
+    with pytest.raises(CheckpointError, match="has no checkpoint .*; --config .* starts a new run with its options"):
         folder.latest_checkpoint()
     for iteration in (900, 20, 1000, 100):
         folder.checkpoint(iteration).touch()
     (folder.checkpoints / "00000999.msgpack.tmp").touch()
     (folder.checkpoints / "mine-00000999.msgpack").touch()
+    temporary_beside(folder.checkpoint(900)).touch()  # of a process that was killed while it wrote
     policy_of(folder.checkpoint(900)).touch()
     kept = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
     assert kept() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
