@@ -17,10 +17,8 @@ def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
 
     They go to a temporary file beside it, which is renamed once everything is on the disk. So neither a crash nor
     another program leaves or sees half a file, and an existing file stays until then. A device or a pipe, such as
-    /dev/null, is written into, not replaced; a link to a file stays one, and an existing file's mode stays.
-
-    Raises:
-      OSError: the file cannot be written; an existing file is untouched.
+    /dev/null, is written into, not replaced; a link to a file stays one, and an existing file's mode stays. Raises
+    OSError, which names the file: it cannot be written; an existing file is untouched.
     """
     if is_device(path):
         with path.open("wb") as file:
@@ -39,8 +37,10 @@ def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
             with contextlib.suppress(FileNotFoundError):  # A new file has the mode of every new file (umask).
                 os.chmod(temporary, stat.S_IMODE(os.stat(path).st_mode))
             os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = error.filename or str(path)  # nothing is named where the disk is full
         raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:

@@ -15,6 +15,7 @@ import numpy as np
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_atomic
+from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.arguments import TrainArguments, printable
 
@@ -56,14 +57,17 @@ class RunFolder:
     def latest_checkpoint(self) -> Path:
         """The newest checkpoint; raises CheckpointError if there is none."""
         if not (paths := self.existing_checkpoints()):
-            raise CheckpointError(f"{self.path}: has no checkpoint to resume from")
+            again = f"; --config {self.path} starts a new run with its options" if self.config.exists() else ""
+            raise CheckpointError(f"{self.path}: has no checkpoint to resume from{again}")
         return paths[-1]
 
     def prune(self, keep: int) -> None:
-        """Delete all but the newest `keep` checkpoints, and their policies."""
+        """Delete all but the newest `keep` checkpoints, and their policies; what a killed process had half written."""
         for path in self.existing_checkpoints()[:-keep]:
-            path.unlink()
             policy_of(path).unlink(missing_ok=True)
+            path.unlink()
+        for path in self.checkpoints.glob(".*.dexsim-part"):
+            path.unlink()
 
     def lock(self) -> contextlib.ExitStack:
         """Keep other processes from training this run, until the result is closed or this process ends. Raises
@@ -83,19 +87,21 @@ class RunFolder:
         if self.report.exists():
             self.report.rename(_free(self.path, "report-{}.json"))
 
-    def set_aside(self, after: int) -> None:
-        """Move checkpoints and the best policy newer than the resumed iteration to `*.aside*`: the resumed run takes
-        another course."""
-        later = [path for path in self.existing_checkpoints() if int(path.stem) > after]
+    def set_aside(self, resumed: Checkpoint) -> None:
+        """Move what is of another course than this checkpoint to `*.aside*`: newer checkpoints, or all where it was set
+        aside itself, their metrics, and the best policy, unless the checkpoint knows it."""
+        paths, path = self.existing_checkpoints(), self.checkpoints / resumed.path.name
+        later = paths[paths.index(path) + 1 :] if path in paths else paths
         later += [policy for path in later if (policy := policy_of(path)).exists()]
-        if self.best.exists() and not self.has_best(after):
-            later.append(self.best)
+        later += [self.metrics] if later and self.metrics.exists() else []
+        later += [self.best] if self.best.exists() and not self.has_best(resumed) else []
         for path in later:
             path.rename(_free(path.parent, path.stem + ".aside{}" + path.suffix))
 
-    def has_best(self, until: int) -> bool:
-        """Whether the best policy is here, and of no later iteration than `until`."""
-        return self.best.exists() and load_policy(self.best).training.get("iteration", 0) <= until
+    def has_best(self, resumed: Checkpoint) -> bool:
+        """Whether the best policy that this checkpoint knows is here."""
+        iteration = resumed.content["progress"]["best"]["iteration"]
+        return self.best.exists() and load_policy(self.best).training.get("iteration") == iteration
 
 
 def policy_of(checkpoint: Path) -> Path:
@@ -113,12 +119,13 @@ class MetricsLog:
     """Appends one line of JSON per logged iteration; the same goes to TensorBoard, if a writer is installed, and to
     Weights & Biases, if the options name a project."""
 
-    def __init__(self, folder: RunFolder, first_iteration: int, arguments: TrainArguments):
+    def __init__(self, folder: RunFolder, arguments: TrainArguments, resumed: Checkpoint | None):
         self._closing = folder.lock()
-        rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
-        # A resumed run repeats what came after its checkpoint.
+        rows = read_metrics(folder.metrics)
+        if resumed:
+            folder.set_aside(resumed)  # It repeats what came after the checkpoint.
+            rows = [row for row in rows if row["iteration"] <= resumed.leaves[".iteration"]]
         write_atomic(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
-        folder.set_aside(first_iteration)
         self._file = self._closing.enter_context(folder.metrics.open("a", buffering=1))
         self._wandb = None
         if arguments.wandb:

@@ -79,7 +79,8 @@ class Run:
         processes.print_on_first("compiling the training step: a minute on two cores, seconds once it is in the cache")
         state, step = self._prepare(source)
         processes.print_on_first(f"compiled in {self.clock['compile_s']:.1f} s")
-        log = MetricsLog(self.folder, int(state.iteration), self.arguments) if processes.is_first() else None
+        resumed = source if isinstance(source, checkpoint.Checkpoint) else None
+        log = MetricsLog(self.folder, self.arguments, resumed) if processes.is_first() else None
         try:
             self._loop(state, step, log, stopped)
         finally:
@@ -101,8 +102,10 @@ class Run:
 
     def _resume(self, source: checkpoint.Checkpoint, shapes: TrainState) -> TrainState:
         state, progress = checkpoint.restore(source, shapes), source.content["progress"]
-        if self.folder.has_best(int(state.iteration)):
+        if self.folder.has_best(source):
             self.best = progress["best"]
+        elif progress["best"]["return"] is not None:  # The file is of another course: the next one replaces it.
+            self.best = {"return": float("nan"), "iteration": 0}
         self.seconds_before, self.without_better = progress["seconds"], progress["without_better"]
         return place(state, shapes)
 
@@ -257,6 +260,7 @@ class Run:
         reports["trained"], film = measure(trained.params, label="trained")
         reports["do_nothing"], _ = measure(trained.params, idle=True, label="doing nothing")
         self.clock["evaluation_s"] = time.perf_counter() - begin
+        print_report(reports["trained"], reports["do_nothing"], title=f"{arguments.task}: {selected.name}")
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
             "task": arguments.task,
@@ -271,7 +275,6 @@ class Run:
         } | cli.environment_report()
         folder.keep_report()
         cli.write_json(folder.report, report)
-        print_report(reports["trained"], reports["do_nothing"], title=f"{arguments.task}: {selected.name}")
         print(f"report: {folder.report}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
             print("rendering the video: a minute on two cores", flush=True)

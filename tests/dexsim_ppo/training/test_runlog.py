@@ -10,6 +10,8 @@ import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.errors import CheckpointError
+from dexsim.core.files import temporary_beside
+from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, policy_of, read_metrics
@@ -19,12 +21,14 @@ from dexsim_ppo.training.trainer import Run
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
-    with pytest.raises(CheckpointError, match="has no checkpoint"):
+    folder.config.touch()
+    with pytest.raises(CheckpointError, match="has no checkpoint .*; --config .* starts a new run with its options"):
         folder.latest_checkpoint()
     for iteration in (900, 20, 1000, 100):
         folder.checkpoint(iteration).touch()
     (folder.checkpoints / "00000999.msgpack.tmp").touch()
     (folder.checkpoints / "mine-00000999.msgpack").touch()
+    temporary_beside(folder.checkpoint(900)).touch()  # of a process that was killed while it wrote
     policy_of(folder.checkpoint(900)).touch()
     kept = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
     assert kept() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
@@ -38,15 +42,17 @@ def test_what_is_set_aside_is_never_replaced(policy, tmp_path):
     """Of every course that an older checkpoint's resume ends: its later checkpoints, and its best policy."""
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
-    policy = dataclasses.replace(policy, training={"iteration": 8})
+    dataclasses.replace(policy, training={"iteration": 8}).save(folder.best)
+    best, progress = folder.best.read_bytes(), {"progress": {"best": {"iteration": 8}}}
     for course in ("first", "second", "third"):
-        for iteration in (4, 8):
-            folder.checkpoint(iteration).write_text(course)
-        policy.save(folder.best)
-        folder.set_aside(8)
+        for path in (folder.checkpoint(4), folder.checkpoint(8), folder.metrics):
+            path.write_text(course)
+        folder.best.write_bytes(best)
+        folder.set_aside(Checkpoint(folder.checkpoint(8), "tiny", progress, {}))
         assert folder.best.exists() and len(folder.existing_checkpoints()) == 2, "all of it is before or at 8"
-        folder.set_aside(6)
+        folder.set_aside(Checkpoint(folder.checkpoint(4), "tiny", {"progress": {"best": {"iteration": 4}}}, {}))
         assert not folder.best.exists() and folder.existing_checkpoints() == [folder.checkpoint(4)]
+    assert [path.read_text() for path in sorted(tmp_path.glob("metrics*"))] == ["first", "second", "third"]
     kept = {path.name: path.read_text() for path in folder.checkpoints.glob("00000008.*")}
     assert kept == {f"00000008.aside{n}.msgpack": c for n, c in ((1, "first"), (2, "second"), (3, "third"))}
     assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
@@ -61,7 +67,8 @@ def test_a_resumed_log_goes_on_after_the_checkpoint_and_to_every_sink(tmp_path, 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: (said.append(given), run)[1]))
     folder = RunFolder(tmp_path)
     folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4, 6, 8)) + '{"iterat')
-    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3))
+    resumed = Checkpoint(folder.checkpoint(6), "tiny", {}, {".iteration": 6})
+    log = MetricsLog(folder, TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3), resumed)
     log.write({"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": float("nan")})
     rows = read_metrics(folder.metrics)  # written at once
     assert [row["iteration"] for row in rows] == [2, 4, 6, 8]

@@ -74,13 +74,15 @@ def copied(finished, tmp_path):
 
 
 def test_a_resumed_run_may_change_its_budget_and_keeps_every_report(copied):
+    """Its best policy may be newer than its checkpoint, of a process that was killed: another one takes its place."""
     first = json.loads(copied.report.read_text())
+    dataclasses.replace(load_policy(copied.best), training={"iteration": 7}).save(copied.best)
     same = ["--seed", "0", "--ppo.learning-rate", "5e-4"]
     looks_on = ["--steps", str(7 * PER_ITERATION), "--evaluation-episodes", "32", "--log-every", "3"]
     assert train.main(["--resume", str(copied.path), *same, *looks_on]) == 0
     assert json.loads((copied.path / "report-1.json").read_text()) == first
     report = json.loads(copied.report.read_text())
-    assert report["seed"] == 0 and report["trained"]["episodes"] == 32
+    assert (report["policy"], report["seed"], report["trained"]["episodes"]) == ("best.msgpack", 0, 32)
     assert load_policy(copied.last).training["iteration"] == 7
     saved = checkpoint.load(copied.latest_checkpoint(), kind="train").content["arguments"]
     assert (saved["seed"], saved["log_every"], saved["evaluation_episodes"]) == (0, 3, 32)
@@ -93,7 +95,10 @@ def test_an_older_checkpoint_is_resumed_for_good(copied):
     content = later.read_bytes()
     assert train.main(["--resume", str(first), "--steps", str(4 * PER_ITERATION), "--keep-checkpoints", "1"]) == 0
     assert copied.latest_checkpoint() == copied.checkpoint(4)
-    assert (copied.checkpoints / "00000006.aside1.msgpack").read_bytes() == content
+    aside = copied.checkpoints / "00000006.aside1.msgpack"
+    assert aside.read_bytes() == content
+    assert train.main(["--resume", str(aside)]) == 0, "back again"
+    assert [load_policy(path).training["iteration"] for path in sorted(copied.path.glob("best*"))] == [6, 4, 6]
 
 
 def contents(folder):
