@@ -73,6 +73,8 @@ class Alarms:
         self._hot, self._current, self._stalled = Lasting(), Lasting(), Lasting()
         self._error, self._off, self._away, self._frozen, self._lost = (Lasting() for _ in range(5))
         self._changed: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, angles as they changed last, command then
+        self._before: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, last command and angles with the motors on
+        self._led = np.zeros(hand.num_joints)  # [J] rad, how far the commands have led ahead of the angles
         self._reports_mode = False  # whether the hand has ever reported that its motors are on
         self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, where a joint with a high current was at first
         self._serious = 0.0  # serious refusals, less the forgiven ones
@@ -150,9 +152,11 @@ class Alarms:
             self._changed = position, goal
         if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
-        # A joint that draws current may press on something. But no command leads beyond `reach`: it was taken there.
-        apart = np.abs(goal - position)
-        lost = (measured.current < _IDLE) | (apart > self.config.reach + _FAR)
+        # A joint that draws current may press on something, as far as its commands lead. Beyond that it was taken.
+        apart, led, before = np.abs(goal - position), self._led, self._before
+        led = np.inf if before is None else led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
+        self._led, self._before = np.clip(led, 0.0, apart), None if command is None else (command, position)
+        lost = (measured.current < _IDLE) | (apart - self._led > _FAR)
         lasts = self._away.update(time, (apart > _FAR) & lost)
         joint = int(lasts.argmax())
         if not text and lasts[joint] > _UNNOTICED:
