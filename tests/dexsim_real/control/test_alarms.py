@@ -191,6 +191,14 @@ def test_frozen_encoders_are_noticed_whatever_current_is_reported(bench, target)
     assert bench.safety.latched == "no joint angle changes while the commands move"
 
 
+def test_one_encoder_that_is_stuck_is_noticed_when_its_commands_have_passed_it(hand, bench):
+    """Whatever current its motor draws."""
+    start, squeeze = bench.now, np.full(12, 0.7, np.float32)
+    while not bench.safety.latched and bench.now < start + 7.0:
+        cycle(bench, wave(bench), read=changed(bench.position, 4, MIDDLE[4]), current=squeeze)
+    assert f"{joint_labels(hand)[4]} does not follow its command" in bench.safety.latched
+
+
 @pytest.mark.parametrize("pair", [[0, 1], [4, 9]])
 def test_two_joints_that_are_swapped_are_noticed_within_a_second(hand, bench, pair):
     """From the moment at which they are far apart; nearly equal angles are no jump when they are swapped."""
