@@ -19,7 +19,7 @@ from dexsim.core.config import Config, Range, setting
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError, open_serial
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, passive_command
+from dexsim_real.wire.frames import Command, Frame, Mode, passive_command
 
 SIDE, SERIAL_NUMBER = 20, 21
 """Registers of the hand's side and of its serial number (32 bytes), by the vendor's header. How an answer holds a
@@ -280,11 +280,13 @@ class HandPort:
 
     def turn_off(self, command: np.ndarray, seconds: float) -> bool:
         """Send a command with all motors off until the hand answers it, over a lost cable too; a port that fails is
-        asked again. Gives up after so many `seconds`; returns whether the hand has confirmed it."""
+        asked again. Gives up after so many `seconds`; returns whether the hand has confirmed it: an answer in which
+        motors are on is a late one, to a command before."""
         until = time.monotonic() + seconds
         while True:
             try:
-                if isinstance(self.exchange(command), Reply):
+                reply = self.exchange(command)
+                if isinstance(reply, Reply) and not np.any(reply.state["joint"]["raw_position"] & 0xF == Mode.POSITION):
                     return True
             except (Exception, SystemExit):  # Of a driver from elsewhere, which may work again.
                 time.sleep(_AGAIN)
