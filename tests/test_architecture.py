@@ -72,9 +72,9 @@ BUDGETS = {
     "dexsim/calibration dexsim/identification": 1_435,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_050,  # goal: 1,900
     "dexsim_ppo": 3_850,  # goal: 4,000
-    "dexsim_real": 8_548,  # goal: 6,500
+    "dexsim_real": 8_551,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 18_002,  # goal: 18,000
+    "tests": 17_992,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -147,6 +147,11 @@ class Reply:
     sequence: int  # number of this exchange since the port was created
     generation: int  # number of handshakes; it grows when the hand was disconnected
 
+    @property
+    def on(self) -> bool:
+        """Whether a motor reports to be on. If all are told to be off, it is a late answer to a command before."""
+        return bool(np.any(self.state["joint"]["raw_position"] & 0xF == Mode.POSITION))
+
 
 class Identity(NamedTuple):
     """What a hand tells about itself; a field is empty if it does not."""
@@ -280,13 +285,12 @@ class HandPort:
 
     def turn_off(self, command: np.ndarray, seconds: float) -> bool:
         """Send a command with all motors off until the hand answers it, over a lost cable too; a port that fails is
-        asked again. Gives up after so many `seconds`; returns whether the hand has confirmed it: an answer in which
-        motors are on is a late one, to a command before."""
+        asked again. Gives up after so many `seconds`; returns whether the hand has confirmed it."""
         until = time.monotonic() + seconds
         while True:
             try:
                 reply = self.exchange(command)
-                if isinstance(reply, Reply) and not np.any(reply.state["joint"]["raw_position"] & 0xF == Mode.POSITION):
+                if isinstance(reply, Reply) and not reply.on:
                     return True
             except (Exception, SystemExit):  # Of a driver from elsewhere, which may work again.
                 time.sleep(_AGAIN)

@@ -114,19 +114,6 @@ def test_a_late_answer_is_thrown_away(monkeypatch):
     assert (port.counts.silent, port.counts.late) == (1, 1)
 
 
-def test_a_late_answer_of_motors_that_are_on_does_not_confirm_that_they_are_off(monkeypatch):
-    """The command between, which turns them off, is lost."""
-
-    def answer(index, block, state):
-        state["joint"]["raw_position"], peer.delay = block["mode"], (0.2, 0.0, 0.001)[index]
-        return b"" if index == 1 else None
-
-    peer = PtyHand(answer)
-    port, _ = memory_port(monkeypatch, peer)
-    assert port.exchange(motors(0.5)) is None
-    assert port.turn_off(port.passive, 1.0) and len(peer.commands) == 3
-
-
 def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request(monkeypatch):
     def answer(index, block, state):
         state["joint"]["position"], peer.delay = index, (0.57, 0.25)[index]
