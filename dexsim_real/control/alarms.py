@@ -154,10 +154,10 @@ class Alarms:
             self._changed = position, goal
         if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
-        ahead, led, before = goal - position, self._led, self._before
+        ahead, before = goal - position, self._before
         apart, moved = np.abs(ahead), before is None or position != before[1]
         # A joint that draws current may press on something, as far as its commands lead. Beyond that it was taken.
-        led = np.inf if before is None else led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
+        led = apart if before is None else self._led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
         self._led, self._before = np.clip(led, 0.0, apart), None if command is None else (command, position)
         lost = (measured.current < _IDLE) | (apart - self._led > _FAR)
         # Nothing to press on keeps an angle from changing both ways: its encoder is stuck.
