@@ -62,7 +62,7 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 14_495,  # goal: 12,500
+    "dexsim": 14_497,  # goal: 12,500
     "dexsim/core": 855,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_260,  # goal: 1,900
     "dexsim/hand dexsim/objects": 2_625,  # goal: 1,900
@@ -74,7 +74,7 @@ BUDGETS = {
     "dexsim_ppo": 3_850,  # goal: 4,000
     "dexsim_real": 8_551,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 17_992,  # goal: 18,000
+    "tests": 17_993,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 
