@@ -90,7 +90,7 @@ class ExchangeLoop:
             if self.port.refusal:
                 self.safety.alarms.refuse(self.port.refusal)
             return None
-        self.driven = on
+        self.driven = on or reply.on
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)
         self.safety.update(sample)

@@ -62,7 +62,7 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 14_495,  # goal: 12,500
+    "dexsim": 14_500,  # goal: 12,500
     "dexsim/core": 855,  # goal: 900
     "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_260,  # goal: 1,900
     "dexsim/hand dexsim/objects": 2_625,  # goal: 1,900
@@ -72,9 +72,9 @@ BUDGETS = {
     "dexsim/calibration dexsim/identification": 1_435,  # goal: 1,500
     "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_050,  # goal: 1,900
     "dexsim_ppo": 3_860,  # goal: 4,000
-    "dexsim_real": 8_525,  # goal: 6,500
+    "dexsim_real": 8_555,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 18_010,  # goal: 18,000
+    "tests": 18_030,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -196,7 +196,7 @@ def _read_mjcf(path: Path, notes: list[str]) -> mujoco.MjSpec:
 def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
     if not allowed:
         names = ", ".join(tendon.name for tendon in spec.tendons)[:60]
-        remedy = "--drop-tendons gives each of their joints a motor, --couple FOLLOWER=LEADER:RATIO couples two"
+        remedy = "give --drop-tendons and, for joints without a motor, --couple FOLLOWER=LEADER:RATIO"
         raise ConfigError(f"tendons {names}: not supported; {remedy}")
     pulled = [actuator for actuator in spec.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON]
     tied = [equality for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_TENDON]

@@ -1,5 +1,6 @@
 """The scene that the physics runs: hand, object and explicit contact pairs in one MuJoCo model."""
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -170,6 +171,7 @@ def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
         "SDF geoms": model.geom_type == mujoco.mjtGeom.mjGEOM_SDF,
         "fluid forces (density, viscosity, wind)": np.append(option.wind, (option.density, option.viscosity)),
         "noslip iterations": option.noslip_iterations,
+        "names object, object_0, … (reserved)": re.search(rb"\0object(_\d+)?\0", model.names) is not None,
         f"flags that disable {', '.join(off)}": off,
         "flag override": option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE,
     }

@@ -17,6 +17,7 @@ from dexsim_real.wire.link import Refusal
 _BOARDS = ("palm", "joint", "tip")
 _STILL = 0.05  # rad, motion below which a joint with high current is stalled
 _FAR, _IDLE = 0.3, 0.15  # rad, A: so far from its command a joint draws 0.8 A, even at a fifth of the stiffness 0.16 A
+_BOTH = 0.15  # rad, to either side of an angle that does not change: a sound joint turned a cube with 0.04
 _MOVED = 0.2  # rad, motion of a command that changes some joint's angle
 _UNNOTICED = 0.3  # s for which a joint may seem not to follow: commands and answers take time
 _BREAK = 0.1  # s without a finding after which it is over
@@ -73,6 +74,9 @@ class Alarms:
         self._hot, self._current, self._stalled = Lasting(), Lasting(), Lasting()
         self._error, self._off, self._away, self._frozen, self._lost = (Lasting() for _ in range(5))
         self._changed: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, angles as they changed last, command then
+        self._before: tuple[np.ndarray, np.ndarray] | None = None  # [J] rad, last command and angles with the motors on
+        self._led = np.zeros(hand.num_joints)  # [J] rad, how far the commands have led ahead of the angles
+        self._ahead = np.zeros((2, hand.num_joints))  # [J] rad, farthest commands before and beyond an unchanged angle
         self._reports_mode = False  # whether the hand has ever reported that its motors are on
         self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, where a joint with a high current was at first
         self._serious = 0.0  # serious refusals, less the forgiven ones
@@ -150,10 +154,16 @@ class Alarms:
             self._changed = position, goal
         if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
-        # A joint that draws current may press on something. But no command leads beyond `reach`: it was taken there.
-        apart = np.abs(goal - position)
-        lost = (measured.current < _IDLE) | (apart > self.config.reach + _FAR)
-        lasts = self._away.update(time, (apart > _FAR) & lost)
+        ahead, before = goal - position, self._before
+        apart, moved = np.abs(ahead), before is None or position != before[1]
+        # A joint that draws current may press on something, as far as its commands lead. Beyond that it was taken.
+        led = apart if before is None else self._led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
+        self._led, self._before = np.clip(led, 0.0, apart), None if command is None else (command, position)
+        lost = (measured.current < _IDLE) | (apart - self._led > _FAR)
+        # Nothing to press on keeps an angle from changing both ways: its encoder is stuck.
+        self._ahead = np.where(moved, ahead, [np.minimum(self._ahead[0], ahead), np.maximum(self._ahead[1], ahead)])
+        stuck = np.minimum(-self._ahead[0], self._ahead[1]) > _BOTH
+        lasts = self._away.update(time, (apart > _FAR) & lost | stuck)
         joint = int(lasts.argmax())
         if not text and lasts[joint] > _UNNOTICED:
             text = (

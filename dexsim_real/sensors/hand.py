@@ -178,12 +178,13 @@ class HandSensing:
         """Mask taxels that have got stuck and follow the zeros of those that touch nothing, by every answer of a run.
 
         `limit` N is the largest force of a finger. Returns whether `tare` has changed, and lines about masked taxels
-        and zeros that have moved far.
+        and zeros that have moved far. Raises HandError: many taxels of a fingertip are stuck.
         """
         before, lines, counts = self.tare, list[str](), self.counts(state)
         stuck = self._stuck.find(np.maximum(counts - before, 0.0), limit / self._per_count)
         if stuck.any():
             self.tare = np.where(stuck, np.float32(np.inf), before)
+            check_masked(self.hand, np.isinf(self.tare))
             lines = self._say_masked(stuck)
         self.tare = self._zero.update(time, counts, self.tare)
         return not np.array_equal(self.tare, before), lines + self._say_wandered()
@@ -259,10 +260,16 @@ def judge_rest(hand: Hand, counts: np.ndarray, most: float) -> np.ndarray:
             what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
             todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
             raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
-        if high[finger].sum() > _MANY:
-            which = taxel_names(hand, high[finger])
-            raise HandError(f"{name}: {high[finger].sum()} taxels are stuck: {which}; power-cycle the hand")
+    check_masked(hand, high)
     return high
+
+
+def check_masked(hand: Hand, stuck: np.ndarray) -> None:
+    """Raises HandError: a fingertip has so many stuck taxels [F, N] that no limit would follow its force."""
+    for name, which in zip(hand.finger_names, stuck, strict=True):
+        if which.sum() > _MANY:
+            text = f"{which.sum()} taxels are stuck: {taxel_names(hand, which)}"
+            raise HandError(f"{name}: {text}; power-cycle the hand")
 
 
 def taxel_names(hand: Hand, which: np.ndarray) -> str:

@@ -19,7 +19,7 @@ from dexsim.core.config import Config, Range, setting
 from dexsim.hand.description import Hand
 from dexsim_real.core.errors import HandError, open_serial
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, passive_command
+from dexsim_real.wire.frames import Command, Frame, Mode, passive_command
 
 SIDE, SERIAL_NUMBER = 20, 21
 """Registers of the hand's side and of its serial number (32 bytes), by the vendor's header. How an answer holds a
@@ -146,6 +146,11 @@ class Reply:
     received: float  # s
     sequence: int  # number of this exchange since the port was created
     generation: int  # number of handshakes; it grows when the hand was disconnected
+
+    @property
+    def on(self) -> bool:
+        """Whether a motor reports to be on. If all are told to be off, it is a late answer to a command before."""
+        return bool(np.any(self.state["joint"]["raw_position"] & 0xF == Mode.POSITION))
 
 
 class Identity(NamedTuple):
@@ -284,7 +289,8 @@ class HandPort:
         until = time.monotonic() + seconds
         while True:
             try:
-                if isinstance(self.exchange(command), Reply):
+                reply = self.exchange(command)
+                if isinstance(reply, Reply) and not reply.on:
                     return True
             except (Exception, SystemExit):  # Of a driver from elsewhere, which may work again.
                 time.sleep(_AGAIN)

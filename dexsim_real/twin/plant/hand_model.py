@@ -21,6 +21,7 @@ PREFIX = "plant/"  # of all names of the MJCF
 _RANGE = 0.05  # rad, largest difference of an end of a joint's range
 _APART = 0.015  # m, largest distance of a fingertip from where the hand has it
 _FREE, _HINGE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
+_FLAGS = ("constraint", "contact", "equality", "frictionloss", "limit", "spring", "damper")  # a hand without is none
 _IN_PAIRS = 1 << 30  # collision bit of geoms that otherwise touch by explicit pairs alone
 
 Pose = tuple[np.ndarray, np.ndarray]
@@ -59,6 +60,9 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     path = Path(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        flags = spec.option.disableflags
+        if off := [flag for flag in _FLAGS if flags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag.upper()}"))]:
+            raise ValueError(f"its <option> disables {', '.join(off)}: remove the flag")
         _let_touch(spec)
         _leave_out_scenery(spec)
         model = spec.compile()

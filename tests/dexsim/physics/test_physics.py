@@ -50,6 +50,7 @@ IGNORED = {
         'delay=".03" nsample="20" armature=".01" damping="0 .01"/><pid joint="knuckle" kp="1" ki="1"/>',
         "actuator delay; actuator armature; actuator damping; dcmotor or pid actuators",
     ),
+    'name="link"': ('name="object_2"', "names object, object_0, … (reserved)"),
     "</sensor>": ('<tactile geom="tip" mesh="wedge"/></sensor>', "tactile sensors"),
     '<jointpos joint="knuckle"': ('<jointpos joint="knuckle" interval=".03"', "sensor delay or interval"),
     "</mujoco>": (

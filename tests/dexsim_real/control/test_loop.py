@@ -31,11 +31,12 @@ class Hand(HandPort):
         self.refusal = step if isinstance(step, Refusal) else None
         if isinstance(step, BaseException):
             raise step
-        if sent < self.silent_until or step != "state":
+        if sent < self.silent_until or step not in ("state", "late"):
             return step if isinstance(step, bool) else None
         self.modes.append(int(command["mode"][0]))
         state = frames.empty_state()
-        state["joint"]["position"], state["joint"]["raw_position"] = MIDDLE, command["mode"]
+        state["joint"]["position"] = MIDDLE
+        state["joint"]["raw_position"] = Mode.POSITION if step == "late" else command["mode"]
         return Reply(state, sent, self.now, len(self.modes), 1)
 
     def close(self):
@@ -121,7 +122,7 @@ def test_the_guard_is_armed_gets_signs_of_life_and_is_told_whether_the_motors_ar
 def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms(loop):
     """A procedure has no guard process: an error of the driver must not leave the motors on."""
     port, off, gone = loop.port, frames.passive_command(), OSError("the adapter is gone")
-    port.plan = [gone, None, False, SystemExit(1)]
+    port.plan = [gone, None, False, "late", SystemExit(1)]
     assert port.turn_off(off, 5.0) and not port.plan
     for answer in (gone, False, True):
         port.plan = [answer] * 100
@@ -141,7 +142,9 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on_and_may_not_h
     run(loop, round(2.0 / CYCLE))
     assert loop.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
     assert loop.driven
-    loop.port.now = loop.port.silent_until
+    loop.port.now, loop.port.plan = loop.port.silent_until, ["late"]
+    run(loop, 1)
+    assert loop.driven, "an answer to a command of before"
     run(loop, 1)
     assert not loop.driven, "it has answered"
     loop.stop()

@@ -188,6 +188,13 @@ def test_a_taxel_that_stays_when_the_load_goes_is_stuck(sensing):
     assert 40 <= number < 65 and lines == ["ring: stuck and read as 0 from now on: taxel column 6 row 5"]
 
 
+def test_a_saturated_fingertip_is_not_masked_but_ends_the_run(sensing):
+    blind = state()
+    blind["tip"]["taxel"]["z"][1] = 255
+    with pytest.raises(HandError, match="index: 120 taxels are stuck: .* and 114 more; power-cycle the hand"):
+        follow(sensing, [blind] * 40, 0.012)
+
+
 # --- zeros that wander -----------------------------------------------------------------------------
 
 

@@ -65,6 +65,7 @@ def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
         ('<geom type="cylinder"', '<joint axis="0 0 1"/><geom type="cylinder"', "(hand) moves: fix it to the world"),
         ("<mujoco model", "<mujoko model", "XML"),
         ('<body name="hand">', '<body name="hand"><site name="palm" pos="0 0 .1"/>', " is 100 mm from"),
+        ("<option ", '<option><flag contact="disable"/></option><option ', "its <option> disables contact: remove the"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_an_error_in_one_line(hand, text, write, old, new, says):
