@@ -74,7 +74,7 @@ BUDGETS = {
     "dexsim_ppo": 3_860,  # goal: 4,000
     "dexsim_real": 8_555,  # goal: 6,500
     "benchmarks": 2_095,
-    "tests": 18_030,  # goal: 18,000
+    "tests": 17_995,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
 

@@ -31,14 +31,6 @@ def test_help_lists_the_commands_and_a_typo_is_named(capsys):
         console.main(["evalute"])
 
 
-def test_help_starts_no_device():
-    """With a platform that does not exist every start of JAX's devices fails."""
-    environment = os.environ | {"JAX_PLATFORMS": "none_such", "COLUMNS": "80"}
-    command = [sys.executable, "-m", "dexsim_ppo.train", "--help"]
-    child = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert child.returncode == 0 and child.stdout.startswith("usage: "), child.stderr
-
-
 def test_a_misspelt_option_is_refused_and_the_right_one_named(capsys):
     default = preset_arguments("grasp", GraspConfig(), "cpu")
     with pytest.raises(SystemExit) as stop:

@@ -90,18 +90,6 @@ print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)), asset_
     assert len(files) == 4 and all(Path(name).is_relative_to(site) for name in files), files
 
 
-def test_no_text_sends_people_to_the_name_of_another_project():
-    """`dexsim` on PyPI is not this library. Sources, pages and notebooks install a checkout or a wheel file."""
-    folders = ("dexsim", "dexsim_ppo", "dexsim_real", "docs", "notebooks", "benchmarks", "tests")
-    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
-    files += [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), ROOT / "Makefile"]
-    text = {path: path.read_text() for path in files if path.suffix in ("", ".py", ".md", ".toml", ".ipynb")}
-    assert len(text) > 100
-    found = r"""pip3? install[^`\n]*[ \t'"]dexsim(-xhand)?(?=[\s'"`\[=<>)]|$)|['"`]dexsim(-xhand)?\["""
-    wrong = [path.name for path, content in text.items() if re.search(found, content, re.MULTILINE)]
-    assert wrong == ["pyproject.toml"], "there extras name `train`"
-
-
 def test_the_distribution_has_the_name_that_messages_give():
     from dexsim.core.install import DISTRIBUTION, install_line
 

@@ -5,7 +5,6 @@ import json
 import math
 import typing
 
-import numpy as np
 import pytest
 
 from dexsim.core.config import Config, Range, from_dict, override, setting, to_dict
@@ -113,11 +112,3 @@ def test_override_replaces_fields_by_their_path():
     ):
         with pytest.raises(ConfigError, match=said):
             from_dict(GraspConfig, override(plain, [entry]))
-
-
-def test_numbers_of_numpy_become_pythons():
-    """As a file gives them back, so that they are saved, hashed and compared like those that were read."""
-    spring = Spring(turns=np.int64(4), stiffness=np.float32(2.5), span=[np.float32(0.5), 1], wound=np.bool_(False))
-    assert spring == from_dict(Spring, json.loads(json.dumps(to_dict(spring))))
-    assert type(spring.turns) is int and type(spring.stiffness) is float and spring.span == (0.5, 1)
-    assert Spring(span=np.array([0.25, 0.5])).span == (0.25, 0.5) and hash(spring)

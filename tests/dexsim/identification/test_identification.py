@@ -12,7 +12,7 @@ import scipy.stats
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import excitation, joint_excitation
 from dexsim.identification.identify import FIT, check_log, evaluate, identify, uncertainty
-from dexsim.identification.joint import PARAMETERS, JointLog, simulate, with_defaults
+from dexsim.identification.joint import JointLog, simulate, with_defaults
 
 PERIOD, SUBSTEPS = 0.015, 3
 TRUTH = dict(
@@ -177,13 +177,6 @@ def test_what_the_signals_never_show(smooth_log):
     names = ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed")
     result = quick(log_of(FREE, target=gentle), names)
     assert group_with(result, "stall_torque") and group_with(result, "no_load_speed")
-
-
-def test_bounds_that_were_run_into_are_reported(smooth_log, monkeypatch):
-    monkeypatch.setitem(PARAMETERS, "coulomb_friction", PARAMETERS["coulomb_friction"]._replace(high=0.01))
-    result = quick(smooth_log, ("stiffness", "damping", "coulomb_friction"))
-    assert result.at_bound == ("coulomb_friction",) and any("its bound" in note for note in result.notes)
-    assert "at its bound" in result.report()
 
 
 def test_intervals_of_a_linear_problem_are_the_textbooks():
