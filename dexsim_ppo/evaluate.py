@@ -180,7 +180,7 @@ def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:
     """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be.
 
-    `quality` "quick" is 640 x 480 with 400 frames, but eight a second at least; "talk" is 1920 x 1080 with 30 a second.
+    `quality` "quick" is 640 x 480 with 200 frames, but eight a second at least; "talk" is 1920 x 1080 with 30 a second.
     """
     from dexsim.render.render import render_episode
 
@@ -189,7 +189,7 @@ def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "qu
     fps = 1.0 / env.control_period
     seconds = jax.tree.leaves(snapshots)[0].shape[0] / fps
     # At fewer than eight pictures a second a gait cannot be followed.
-    size, rate = ((1920, 1080), 30.0) if quality == "talk" else ((640, 480), min(max(400 / seconds, 8.0), fps))
+    size, rate = ((1920, 1080), 30.0) if quality == "talk" else ((640, 480), min(max(200 / seconds, 8.0), fps))
     return Path(render_episode(env, snapshots, path, fps, size=size, rate=rate))
 
 
