@@ -49,7 +49,7 @@ class PPOConfig(Config):
     """Iterations after which `kl_target` has halved; after twice as many it is a third. 0 keeps it."""
     critic_first: int = setting(0, unit="iterations", low=0)
     """Initial iterations that train only the critic: in fine-tuning it is new. Above 0, the critic always learns at
-    `learning_rate_max`, and the actor's observations keep their normalisation."""
+    `learning_rate_max`."""
     initial_std: float = setting(0.6, unit="1", low=1e-3, high=10.0)
     """Initial standard deviation of actions, whose range is [-1, 1]."""
     std_min: float = setting(0.05, unit="1", low=1e-4, high=10.0)

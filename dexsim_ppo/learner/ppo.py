@@ -192,8 +192,6 @@ def prepare(
         group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
         for group, stats in state.observation_stats.items()
     }
-    if config.critic_first:  # In fine-tuning: other inputs are another policy, sooner than small steps make up for.
-        observation_stats |= {"actor": state.observation_stats["actor"]}
     old_mean, old_std = state.value_stats.mean, value_std(state.value_stats)
     value_stats = merge_moments(state.value_stats, means["target"], variances["target"], size)
     mean, std = value_stats.mean, value_std(value_stats)

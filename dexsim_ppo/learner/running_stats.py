@@ -12,6 +12,8 @@ from dexsim.core.pytree import align, pytree_dataclass, static
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
 # cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
 MEMORY = 2**27
+FIXED = -1
+"""Count of statistics that no sample changes."""
 
 
 @pytree_dataclass
@@ -42,12 +44,12 @@ def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, siz
 
     Elements that are not finite stay unchanged.
     """
-    count = jnp.minimum(stats.count, MEMORY) + size
-    weight = size / count.astype(jnp.float32)
+    fixed, count = stats.count == FIXED, jnp.minimum(stats.count, MEMORY) + size
+    weight = jnp.where(fixed, 0.0, size / count.astype(jnp.float32))
     delta = mean - stats.mean
     mean = stats.mean + weight * delta
     variance = (1 - weight) * stats.variance + weight * variance + weight * (1 - weight) * delta**2
-    ok = jnp.isfinite(mean) & jnp.isfinite(variance)
+    ok, count = jnp.isfinite(mean) & jnp.isfinite(variance), jnp.where(fixed, FIXED, count)
     return RunningStats(count, jnp.where(ok, mean, stats.mean), jnp.where(ok, variance, stats.variance))
 
 
@@ -66,10 +68,10 @@ def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_f
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
     """Statistics [n] from which `make_normalizer` makes this normaliser, for entries without a fixed scale.
 
-    Their count is the largest, so that further samples hardly change them.
+    Fixed: other inputs would be another policy, sooner than a fine-tuning's small steps make up for.
     """
     variance = jnp.maximum(normalizer.std**2 - std_floor**2, 0.0)
-    return RunningStats(jnp.int32(MEMORY), jnp.copy(normalizer.mean), variance)
+    return RunningStats(jnp.int32(FIXED), jnp.copy(normalizer.mean), variance)
 
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:

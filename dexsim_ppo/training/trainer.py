@@ -277,7 +277,7 @@ class Run:
         cli.write_json(folder.report, report)
         print(f"report: {folder.report}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
-            print("rendering the video: a minute or two on two cores", flush=True)
+            print("rendering the video: a few minutes on two cores", flush=True)
             print(f"video: {write_video(self.evaluator.env, film, folder.path / 'policy.mp4')}")
         module = task_option(arguments.task)
         if hasattr(self.env, "hand") and not module:
