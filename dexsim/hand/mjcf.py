@@ -8,6 +8,9 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 
+_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper")
+"""Flags that say what a hand is like; gravity is the task's, and others say how MuJoCo works it out."""
+
 
 def read_mjcf(hand: Hand) -> mujoco.MjSpec:
     """The hand's MJCF without actuators, sensors and keyframes, the palm at the world's origin.
@@ -33,6 +36,12 @@ def read_mjcf(hand: Hand) -> mujoco.MjSpec:
         root.pos, root.quat = place[:3, 3], quaternion(place[:3, :3])
     _write_down_masses(spec, model)
     return spec
+
+
+def disabled(option: Any) -> str:
+    """What an MJCF's <option> disables of what makes a hand; empty if nothing."""
+    off = [f for f in _FLAGS if option.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
+    return f"<option> disables {', '.join(off)}" if off else ""
 
 
 def _write_down_masses(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

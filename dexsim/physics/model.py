@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.description import Hand
-from dexsim.hand.mjcf import read_mjcf
+from dexsim.hand.mjcf import disabled, read_mjcf
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsScene
@@ -21,8 +21,6 @@ _MJX_CONTACTS = 20
 """Contacts that MJX keeps in an environment, the deepest: memory and time grow with them."""
 _FRICTION_RATIO = 20.0
 """How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
-_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper")
-"""Flags that say what a hand is like; gravity is the task's, and others say how MuJoCo works it out."""
 
 
 def build_scene(
@@ -156,7 +154,6 @@ def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
     """Raise AssetError naming every feature of a hand that our scene drops or MJX silently ignores: a policy trained on
     such a model would be for a hand that does not exist."""
     option, motors = model.opt, np.isin(model.actuator_dyntype, (mujoco.mjtDyn.mjDYN_DCMOTOR, mujoco.mjtDyn.mjDYN_PID))
-    off = [f for f in _FLAGS if option.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
     features = {
         "actuator delay": np.c_[model.actuator_delay, model.actuator_history[:, 0]],
         "actuator armature": model.actuator_armature,
@@ -172,7 +169,7 @@ def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
         "fluid forces (density, viscosity, wind)": np.append(option.wind, (option.density, option.viscosity)),
         "noslip iterations": option.noslip_iterations,
         "names object, object_0, … (reserved)": re.search(rb"\0object(_\d+)?\0", model.names) is not None,
-        f"flags that disable {', '.join(off)}": off,
+        disabled(option): disabled(option),
         "flag override": option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE,
     }
     if there := [name for name, values in features.items() if np.any(values)]:

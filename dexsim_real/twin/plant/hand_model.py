@@ -14,14 +14,13 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies
-from dexsim.hand.mjcf import read_mjcf
+from dexsim.hand.mjcf import disabled, quaternion, read_mjcf
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF
 _RANGE = 0.05  # rad, largest difference of an end of a joint's range
 _APART = 0.015  # m, largest distance of a fingertip from where the hand has it
 _FREE, _HINGE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
-_FLAGS = ("constraint", "contact", "equality", "frictionloss", "limit", "spring", "damper")  # a hand without is none
 _IN_PAIRS = 1 << 30  # collision bit of geoms that otherwise touch by explicit pairs alone
 
 Pose = tuple[np.ndarray, np.ndarray]
@@ -60,9 +59,8 @@ def read_model(path: str | Path, hand: Hand) -> HandModel:
     path = Path(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        flags = spec.option.disableflags
-        if off := [flag for flag in _FLAGS if flags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag.upper()}"))]:
-            raise ValueError(f"its <option> disables {', '.join(off)}: remove the flag")
+        if problem := disabled(spec.option):
+            raise ValueError(f"its {problem}: remove the flag")
         _let_touch(spec)
         _leave_out_scenery(spec)
         model = spec.compile()
@@ -85,11 +83,9 @@ def _in_palm_frame(
     name: str, spec: mujoco.MjSpec, palm: Pose, hand: Hand, joints: Sequence[str], lattices: list[str], foreign=False
 ) -> HandModel:
     """The model with its palm as the world's frame, and prefixed names."""
-    place, turn = palm
-    quat, world = np.empty(4), mujoco.MjSpec()
-    mujoco.mju_mat2Quat(quat, turn.T.ravel())
+    (place, turn), world = palm, mujoco.MjSpec()
     world.option = spec.option
-    world.attach(spec, frame=world.worldbody.add_frame(pos=-turn.T @ place, quat=quat), prefix=PREFIX)
+    world.attach(spec, frame=world.worldbody.add_frame(pos=-turn.T @ place, quat=quaternion(turn.T)), prefix=PREFIX)
     joints, lattices = ([PREFIX + name for name in names] for names in (joints, lattices))
     return HandModel(name, world, joints, hand.torque_limit, lattices, foreign)
 
@@ -202,9 +198,8 @@ def _add_lattices(spec: mujoco.MjSpec, data: mujoco.MjData, hand: Hand, palm: Po
     turns = palm[1] @ _hand_tips(hand, np.zeros(hand.num_joints))[1]
     names = [f"lattice_{finger}" for finger in hand.finger_names]
     for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
-        body, quat = int(data.model.site_bodyid[site]), np.empty(4)
+        body = int(data.model.site_bodyid[site])
         frame = data.xmat[body].reshape(3, 3)
-        mujoco.mju_mat2Quat(quat, (frame.T @ turn).ravel())
         place = frame.T @ (data.site_xpos[site] - turn @ offset - data.xpos[body])
-        spec.bodies[body].add_site(name=name, pos=place, quat=quat)
+        spec.bodies[body].add_site(name=name, pos=place, quat=quaternion(frame.T @ turn))
     return names

@@ -57,7 +57,7 @@ IGNORED = {
         """<option viscosity="1e-5" noslip_iterations="3" o_solref="0.1 1">
         <flag limit="disable" contact="disable" override="enable"/></option>
         <asset><mesh name="wedge" vertex="0 0 0  .01 0 0  0 .01 0  0 0 .01"/></asset></mujoco>""",
-        "fluid forces (density, viscosity, wind); noslip iterations; flags that disable limit, contact; flag override",
+        "fluid forces (density, viscosity, wind); noslip iterations; <option> disables limit, contact; flag override",
     ),
 }
 
