@@ -17,12 +17,10 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from dexsim.calibration.maps import save_calibration
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
-from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.process import use_realtime
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
@@ -84,7 +82,7 @@ class Twin:
         except BaseException:
             terminal.close()
             raise
-        self._first, self._done, self._stop = plant.trial, 0, False  # of the trials
+        self._stop = False
 
     def stop(self) -> None:
         """End soon; may be called from a signal handler."""
@@ -92,8 +90,9 @@ class Twin:
 
     def run(self) -> None:
         """Run until all trials have ended, or `stop` was called."""
+        first, done, trials = self.plant.trial, 0, self.arguments.trials
         self.now = time.monotonic()
-        while not self._stop:
+        while not self._stop and done < trials:
             now = time.monotonic()
             self.line.serve(now)
             # What takes long waits when the port is due soon, but not for ever.
@@ -102,9 +101,13 @@ class Twin:
             if now >= due and (free or now > due + 0.01):
                 self.catch_up(now, SLICE)
                 self.sensor.serve(now)
-            self._count_trials()
+            if self.plant.trial > first + done:
+                done = self.plant.trial - first
+                self.note(f"end of trial {done} of {trials}: {self.plant.results()[done - 1].get('end', '')}")
             pause = (min(due, self.line.due()) if free else self.line.due()) - time.monotonic()
             select.select([self.line.terminal], [], [], max(pause, 0.0))
+        if done >= trials:
+            self.note("all trials are over: the hand's port closes")
 
     def catch_up(self, now: float, limit: float = 0.01) -> None:
         """Advance the plant to a time in s, by at most `limit` s; on a slow machine its time slips."""
@@ -129,33 +132,6 @@ class Twin:
         """Show an event, with its time."""
         self._show(f"{time.monotonic() - self.start:9.3f} s  {text}")
 
-    def report(self) -> dict[str, Any]:
-        """Results of the trials, and what befell the line; JSON-able."""
-        trials = self.plant.results()[: self.arguments.trials]
-        return {"trials": trials, "line": dict(self.line.counts), "slipped_s": round(self.slipped, 3)}
-
-    def runner_command(self, calibration: Path) -> list[str]:
-        """The command that runs the shipped policy of the task on this hand."""
-        words = ["python", "-m", "dexsim_real.run", self.arguments.task, "--port", str(self.line.terminal.name)]
-        words += ["--calibration", str(calibration), "--yes", *self.sensor.option]
-        return words + (["--hand", self.arguments.hand] if self.arguments.hand else [])
-
-    def _count_trials(self) -> None:
-        done, trials = self.plant.trial - self._first, self.arguments.trials
-        if done == self._done:
-            return
-        self._done = done
-        self.note(f"end of trial {done} of {trials}: {self.plant.results()[done - 1].get('end', '')}")
-        if done >= trials:
-            self._stop = True
-            self.note("all trials are over: the hand's port closes")
-
-
-def make_plant(arguments: TwinArguments, hand: Hand) -> EmulatedHand:
-    """The physics for the options."""
-    options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "plant_model")}
-    return EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.parameters, **options)
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
@@ -172,24 +148,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as temporary:
         folder = arguments.folder or Path(temporary)
         show = functools.partial(print, flush=True)
-        twin = Twin(arguments, make_plant(arguments, hand), folder, show)
+        options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "plant_model")}
+        plant = EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.parameters, **options)
+        twin = Twin(arguments, plant, folder, show)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: twin.stop())
         calibration = Path(temporary) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
         known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
         save_calibration(calibration, known)
+        port = str(twin.line.terminal.name)
+        command = ["python", "-m", "dexsim_real.run", arguments.task, "--port", port]
+        command += ["--calibration", str(calibration), "--yes", *twin.sensor.option]
+        command += ["--hand", arguments.hand] if arguments.hand else []
         try:
-            show(
-                f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
-                f"    {shlex.join(twin.runner_command(calibration))}"
-            )
+            show(f"{arguments.task}: the emulated hand is at {port}. Run a policy on it with")
+            show(f"    {shlex.join(command)}")
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
             twin.run()
         finally:
             twin.close()
             if arguments.output:
-                cli.write_json(arguments.output, twin.report())
+                report = {"trials": plant.results()[: arguments.trials], "line": dict(twin.line.counts)}
+                cli.write_json(arguments.output, report | {"slipped_s": round(twin.slipped, 3)})
     return 0
 
 

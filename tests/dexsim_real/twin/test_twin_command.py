@@ -38,7 +38,7 @@ def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(tmp_path):
 SCRIPTED = """
 import sys, twin_plant
 from dexsim_real.twin import __main__ as command
-command.make_plant = lambda arguments, hand: twin_plant.ScriptedPlant(arguments.seconds or float("inf"))
+command.EmulatedHand = lambda *hand, seconds, **options: twin_plant.ScriptedPlant(seconds or float("inf"))
 sys.exit(command.main(sys.argv[1:]))
 """
 
