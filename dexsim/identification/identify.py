@@ -121,20 +121,19 @@ def identify(
         check_log(recording)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
-    latency, count = search.latency, search.count
-    fitted = search.names[:count]
-    theta, low, high = (part[:count] for part in (search.theta, search.low, search.high))
-    residual = search.residual(search.theta, search.starts)
+    latency, fitted, count = search.latency, search.names, len(search.names)
+    theta, low, high = search.theta, search.low, search.high
+    residual = search.residual(theta, search.starts)
     rmse = search.noise[0] * np.sqrt(np.mean(residual[: len(log.position)] ** 2))
     first = {name: float(value) for name, value in search.fixed.items()}
-    values = first | dict(zip(search.names, search.theta.tolist(), strict=True)) | {"start": float(search.starts[0])}
-    size = np.maximum(np.abs(theta), search.typical[:count])  # what counts as a relative change of 1
-    jacobian = search.jacobian(search.theta, search.starts, count)
+    values = first | dict(zip(fitted, theta.tolist(), strict=True)) | {"start": float(search.starts[0])}
+    size = np.maximum(np.abs(theta), search.typical)  # what counts as a relative change of 1
+    jacobian = search.jacobian(theta, search.starts)
     sizes = np.append(size, np.full(len(search.starts), 0.05))
     half, correlation, null = uncertainty(jacobian, residual, sizes, search.segment)
     half, correlation = half[:count], correlation[:count, :count]
-    least, largest = (part[:count] for part in search.plausible())
     # What was seen to fit as well farther off widens what the curvature says.
+    least, largest = search.plausible()
     least, largest = np.minimum(theta - half, least).clip(low), np.maximum(theta + half, largest).clip(None, high)
     vague = np.maximum(half, (largest - least) / 2) > _NORMAL * _VAGUE * size
     unidentifiable = _groups(fitted, [members[:count] for members in null], correlation, vague)
@@ -143,7 +142,7 @@ def identify(
     # All from the solution and with the weights found last: costs under other weights cannot be compared.
     cost = {}
     for search.latency in sorted(latencies):
-        cost[search.latency] = search.solve(search.theta, 10)[0]
+        cost[search.latency] = search.solve(theta, 10)[0]
     limit = min(cost.values()) * (1 + _CHI2 / max(residual.size - count, 1))
     plausible = tuple(lag for lag in cost if cost[lag] <= limit)
     before = after = float("nan")
@@ -320,7 +319,7 @@ def _crowd_costs(data: _Data, crowd: jax.Array, starts: jax.Array, latency: jax.
 
 
 class Search:
-    """One log's least squares: theta [P] (what is fitted, the dead-band last), the starts [S], and the latency.
+    """One log's least squares: theta [P] (what is fitted, a dead-band last), the starts [S], and the latency.
 
     The arguments are those of `identify`, the log is checked.
 
@@ -343,12 +342,11 @@ class Search:
         self.dead_band = dead_band
         self.fixed = with_defaults(dict(start), log)
         self.segment, angle = segments(log)
-        self.names = (*dict.fromkeys(fit), "dead_band")
-        self.count = len(self.names) - (dead_band is None)
-        """Parameters that are fitted in the end."""
+        self.names = (*dict.fromkeys(fit), *(() if dead_band is None else ("dead_band",)))
         parameters = [PARAMETERS[name] for name in self.names]
         self.low, self.high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
-        self.low[-1], self.high[-1] = dead_band or (self.low[-1], self.high[-1])
+        if dead_band is not None:
+            self.low[-1], self.high[-1] = dead_band
         self.typical = np.array([p.typical for p in parameters])
         begin = np.array([float(self.fixed[name]) for name in self.names])
         for name, value, low, high in zip(self.names, begin, self.low, self.high, strict=True):
@@ -362,7 +360,8 @@ class Search:
         # From a bound, where a friction's gradient may vanish, the search would not set off.
         inside = 0.05 * np.minimum(self.scale, self.high - self.low)
         self.theta = np.clip(begin, self.low + inside, self.high - inside)
-        self.theta[-1] = begin[-1]
+        if dead_band is not None:
+            self.theta[-1] = begin[-1]
         self.starts = angle - float(self.fixed["encoder_bias"])
         self.measured = np.stack([log.position] if log.torque is None else [log.position, log.torque])
         self.noise = np.array(_NOISE)[: len(self.measured)]
@@ -390,8 +389,8 @@ class Search:
         error = self._call(_readings, theta, starts) - self.measured
         return (error / self.noise[:, None]).ravel()
 
-    def jacobian(self, theta: np.ndarray, starts: np.ndarray, count: int) -> np.ndarray:
-        """Of `residual`, [C * T, count + S], by the first parameters, in their own units, and the starts."""
+    def jacobian(self, theta: np.ndarray, starts: np.ndarray, count: int | None = None) -> np.ndarray:
+        """Of `residual`, [C * T, P + S], by the (first) parameters, in their own units, and the starts."""
         slope = self._call(_slopes, theta, starts) / self.noise[:, None, None]
         own = slope[..., -1:] * (self.segment[:, None] == np.arange(len(starts)))
         slope = np.concatenate([slope[..., self._index[:count]], own], -1)
@@ -399,7 +398,7 @@ class Search:
 
     def solve(self, theta: np.ndarray, evaluations: int, fixed: int = 0) -> tuple[float, np.ndarray, np.ndarray]:
         """Sum of squares, theta and starts of the fit by gradient, without the last `fixed` of the parameters."""
-        count, parts = self.count - fixed, len(self.starts)
+        count, parts = len(theta) - fixed, len(self.starts)
         scale = np.concatenate([self.scale[:count], np.full(parts, 0.01)])
         reach = 0.05  # rad that a start may be off the angle that was read
         low = np.concatenate([self.low[:count], self.starts - reach]) / scale
@@ -460,20 +459,19 @@ class Search:
     def _explore(self, rounds: int, crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
         dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
-        count, scale = self.count, self.scale[: self.count]
-        slope = self.jacobian(self.theta, self.starts, count)[:, :count] * scale
-        middle = self.theta[:count] / scale
+        count, scale = len(self.theta), self.scale
+        slope = self.jacobian(self.theta, self.starts)[:, :count] * scale
+        middle = self.theta / scale
         spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
         rng, weight = np.random.default_rng(0), 1.0 / jnp.asarray(self.noise, jnp.float32)
         self._seen = []
         for _ in range(rounds):
             tries = rng.multivariate_normal(middle, spread, crowd)
-            tries = np.clip(tries, self.low[:count] / scale, self.high[:count] / scale)
+            tries = np.clip(tries, self.low / scale, self.high / scale)
             tries[: 2 * count + 1] = middle
             for end, bound in enumerate((self.low, self.high)):  # Where a limit binds hardly ever, curvature misleads.
-                tries[1 + end * count :][range(count), range(count)] = bound[:count] / scale
-            thetas = np.tile(self.theta, (crowd, 1))
-            thetas[:, :count] = tries * scale
+                tries[1 + end * count :][range(count), range(count)] = bound / scale
+            thetas = tries * scale
             costs = self._call(_crowd_costs, thetas, self.starts, weight, far=np.inf)
             order = np.argsort(costs)
             self._seen.append((thetas, costs))
@@ -482,7 +480,7 @@ class Search:
             before = self.best
             self._attempt(thetas[order[0]], 6)
             if self.best < before:
-                middle = self.theta[:count] / scale
+                middle = self.theta / scale
 
     # --- what fits as well ------------------------------------------------------------------------
 
