@@ -100,7 +100,8 @@ class Twin:
             free = self.line.due() - now > _BUSY
             if now >= due and (free or now > due + 0.01):
                 self.catch_up(now, SLICE)
-                self.sensor.serve(now)
+                if now >= self.sensor.due:
+                    self.sensor.serve(now)
             if self.plant.trial > first + done:
                 done = self.plant.trial - first
                 self.note(f"end of trial {done} of {trials}: {self.plant.results()[done - 1].get('end', '')}")

@@ -305,9 +305,7 @@ class EmulatedImu:
         self.terminal.close()
 
     def serve(self, now: float) -> None:
-        """Send a sample if one is due at this time in s."""
-        if now < self.due:
-            return
+        """Send a sample at a time in s."""
         self.due = max(self.due + 1 / IMU_RATE, now)
         self.terminal.read()  # It ignores what it receives.
         self.terminal.write(self.frames.sample())
@@ -342,9 +340,7 @@ class EmulatedCamera:
         self.path.unlink(missing_ok=True)
 
     def serve(self, now: float) -> None:
-        """Send a mask if one is due at this time in s, and somebody listens."""
-        if now < self.due:
-            return
+        """Send a mask at a time in s, if somebody listens."""
         self.due = max(self.due + 1 / CAMERA_RATE, now)
         with contextlib.suppress(BlockingIOError):
             self._client, self._waiting = self._server.accept()[0], b""
