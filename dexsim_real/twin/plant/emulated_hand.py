@@ -220,7 +220,7 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._referee = Referee(self.task, self.start, self.seconds, self.hand.num_fingers)
-        put(scene, self._data, place.shelf, place.quat)
+        put(scene, self._data, place.position + _SHELF, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
 
@@ -277,7 +277,7 @@ class EmulatedHand:
         if self.stage is Stage.FREE:
             mujoco.mj_step(scene.model, data, self._substeps)
             return
-        position = self._place.position if self.stage is Stage.HOLD else self._place.shelf
+        position = self._place.position if self.stage is Stage.HOLD else self._place.position + _SHELF
         for _ in range(self._substeps):
             put(scene, data, position, self._place.quat)
             mujoco.mj_step(scene.model, data)
@@ -294,11 +294,9 @@ class EmulatedHand:
     def _sample_skin(self) -> None:
         scene, data, body = self._scene, self._data, self._scene.object_body
         self._touches = tip_contacts(scene, data)
-        force = self._no_force
-        if self._touches:
-            tips = data.site_xpos[scene.tip_site], data.site_xmat[scene.tip_site].reshape(-1, 3, 3)
-            rotation = data.xmat[body].reshape(3, 3)
-            force = self._skin.load(self.shape, data.xpos[body], rotation, tips, self._touches)
+        tips = data.site_xpos[scene.tip_site], data.site_xmat[scene.tip_site].reshape(-1, 3, 3)
+        rotation = data.xmat[body].reshape(3, 3)
+        force = self._skin.load(self.shape, data.xpos[body], rotation, tips, self._touches)
         self._samples.append((self.time, force))
 
     def _look(self) -> None:
@@ -353,7 +351,7 @@ class EmulatedHand:
         reaction = float(self.parameters.value.get("reaction", 0.0))
         if self._moved is not None and self.time - self._moved >= reaction:
             self.stage = Stage.FREE
-            put(self._scene, self._data, *self._place[:3])
+            put(self._scene, self._data, *self._place)
             self._pushes.begin(self.time)
 
 
@@ -402,7 +400,6 @@ class Place(NamedTuple):
     position: np.ndarray  # [3] m
     quat: np.ndarray  # [4]
     velocity: np.ndarray  # [3] m/s
-    shelf: np.ndarray  # [3] m, where the object waits
 
 
 def find_place(
@@ -431,7 +428,7 @@ def find_place(
             down = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
             position = np.array([face + gap + shape.reach(down), *(start.place + shift)])
         if position is not None and is_clear(scene, data, position, quat):
-            return Place(position, quat, np.array([speed, 0.0, 0.0]), position + _SHELF)
+            return Place(position, quat, np.array([speed, 0.0, 0.0]))
     return None
 
 

@@ -12,7 +12,8 @@ may not choose what it is tested by. The other ranges repeat training's; a test 
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -163,18 +164,12 @@ def skill_of(task: str) -> str:
     return task.partition("_")[0]
 
 
-@dataclasses.dataclass(frozen=True)
-class TrialParameters:
-    """Parameters of one trial, by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`. Each is also an attribute."""
+class TrialParameters(SimpleNamespace):
+    """Parameters of one trial, by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`, as attributes and in `value`."""
 
-    task: str
-    value: dict[str, np.ndarray]
-
-    def __getattr__(self, name: str) -> Any:
-        value = self.__dict__["value"].get(name)
-        if value is None:
-            raise AttributeError(name)
-        return value if value.ndim else float(value)
+    def __init__(self, task: str, value: dict[str, np.ndarray]):
+        numbers = {name: number if number.ndim else float(number) for name, number in value.items()}
+        super().__init__(task=task, value=value, **numbers)
 
 
 def sample_trial(

@@ -67,8 +67,10 @@ class EmulatedTaxels:
                 square = ((taxels - contact.point) ** 2).sum(-1)
                 around = np.exp(-(square - square.min()) / (2 * _SPREAD**2))
                 near += normal * (around / around.sum())
-            if not self._by_point:
-                near = self._squeeze(shape, (taxels - place) @ turn) * self._area[finger]
+            if not self._by_point:  # The pressure of the rubber; its scale is arbitrary.
+                depth = self._parameters.rubber - shape.distance((taxels - place) @ turn)
+                squeeze = np.clip(depth / self._parameters.skin_thickness, 0.0, 1 - _LEFT)
+                near = squeeze / (1.0 - squeeze) * self._area[finger]
             share = near / (near.sum() or 1.0)
             axes = np.einsum("ij,nkj->nki", frame, self._axes[finger])
             force[finger] = share[:, None] * (axes @ dragged)
@@ -92,9 +94,3 @@ class EmulatedTaxels:
         # Height above a taxel counts only beyond the rubber's thickness.
         beyond = np.maximum(np.abs(height) - self._parameters.skin_thickness, 0.0)
         return float(np.sqrt((along + beyond**2).min()))
-
-    def _squeeze(self, shape: ObjectShape, points: np.ndarray) -> np.ndarray:
-        """Pressure [N] of the rubber over taxels at `points` [N, 3] m in the object's frame; its scale is arbitrary."""
-        depth = self._parameters.rubber - shape.distance(points)
-        squeeze = np.clip(depth / self._parameters.skin_thickness, 0.0, 1 - _LEFT)
-        return squeeze / (1.0 - squeeze)
