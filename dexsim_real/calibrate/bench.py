@@ -87,8 +87,6 @@ class CalibrateArguments(LoopOptions):
     """With --identify: calibration file of this hand; None leaves torques unknown."""
     joints: tuple[str, ...] = ()
     """With --identify: joints to move; all by default."""
-    dead_band: bool = False
-    """With --identify: also fit the dead band of the drives, which takes minutes per joint."""
     plot: Path | None = None
     """Image file for the figure (.png, .pdf or .svg); None draws no figure."""
     log: Path | None = None
@@ -112,10 +110,9 @@ class CalibrateArguments(LoopOptions):
         if self.gauge and self.yes:
             raise HandError("--gauge needs answers, but --yes asks nothing; remove one of them")
         # With another finger or joint than meant the wrong one would move.
-        for name in ("joints", "dead_band") if not self.identify else ("fingers", "gauge", "plot"):
+        for name in ("fingers", "gauge", "plot") if self.identify else ("joints",):
             if getattr(self, name):
-                word = "not" if self.identify else "only"
-                raise HandError(f"--{name.replace('_', '-')} is {word} for --identify")
+                raise HandError(f"--{name} is {'not' if self.identify else 'only'} for --identify")
         if self.press.current >= self.safety.current:
             raise HandError(f"--press.current must be below --safety.current, {self.safety.current:g} A")
         if self.press.peak >= 0.9 * self.safety.finger_force:

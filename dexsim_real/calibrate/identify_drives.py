@@ -63,8 +63,8 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
                 "no_load_speed": float(hand.speed_limit[joint]),
                 "inertia": float(model.dof_M0[model.joint(name).dofadr[0]]),  # kg m^2
             }
-            substeps, band = max(round(log.period / _TIMESTEP), 1), (0.0, 0.03) if arguments.dead_band else None
-            result = identify(log, start, substeps=substeps, dead_band=band, holdout=holdout)
+            substeps = max(round(log.period / _TIMESTEP), 1)
+            result = identify(log, start, substeps=substeps, dead_band=None, holdout=holdout)
         except DexsimError as error:
             failed[name] = error
             operator.tell(f"not identified: {name}: {error}")

@@ -201,7 +201,10 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
             notes.append(f"{label}: loaded by shear while the {name} was pressed; press with the side")
             continue
         way = _direction(part.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
-        way[_at_limit(part.current[:, joint], part.run)] = 0
+        # A current that stays at the maximum of the press is the motor's limit.
+        current, run = np.abs(part.current[:, joint]), part.run
+        top = current > _TOP * ndimage.maximum(current, run, run)
+        way[top & (ndimage.sum_labels(top, run, run) >= _TOP_BLOCKS)] = 0
         if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
             notes.append(f"{label}: hardly moved while the {name} was pressed; press on something softer, more often")
             continue
@@ -251,13 +254,6 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
     noise = jitter / np.sqrt(max(_BLOCK * recording.rate, 1)) / (np.sqrt(2) * _BLOCK)
     usual = np.quantile(np.abs(speed), 0.75)
     return np.where(np.abs(speed) > max(_STILL * usual, _NOISE * noise), np.sign(speed), 0).astype(int)
-
-
-def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
-    size = np.abs(current)
-    top = size > _TOP * ndimage.maximum(size, run, run)
-    return top & (ndimage.sum_labels(top, run, run) >= _TOP_BLOCKS)
 
 
 def _force_per_torque(hand: Hand, calibration: Calibration, joints: Mapping[str, JointFit]) -> np.ndarray:

@@ -55,7 +55,7 @@ class TwinArguments(Config):
     folder: Path | None = None
     """Folder for the ports `hand` and `imu` (rotate) and the socket `masks` (grasp); None for a new temporary one."""
     output: Path | None = None
-    """JSON file for results, statistics and events, written at the end; None writes no file."""
+    """JSON file for results and statistics, written at the end; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
     plant_model: Path | None = None
