@@ -1,10 +1,10 @@
 """One joint with its drive, simulated from commanded targets: what identification fits.
 
-    I qdd = friction(drive(target delayed, q, qd)) - g_cos cos(q) - g_sin sin(q)
+    I qdd = friction(drive(target delayed, q, qd))
 
 The joint alone: its inertia about the axis is constant (the diagonal of the hand's mass matrix, rotor included), the
-other joints stand still, nothing touches, gravity goes with the angle. Integrated as the physics does, semi-implicit
-Euler at the physics' time step with the same drive, so that what is fitted here means the same there.
+other joints stand still, nothing touches, no weight. Integrated as the physics does, semi-implicit Euler at the
+physics' time step with the same drive, so that what is fitted here means the same there.
 """
 
 import dataclasses
@@ -42,12 +42,8 @@ PARAMETERS = {
     "coulomb_friction": Parameter("Nm", 0.01, 0.0, 1.0, 0.0),
     "viscous_friction": Parameter("Nm s/rad", 0.005, 0.0, 1.0, 0.0),
     "inertia": Parameter("kg m^2", 1e-3, 1e-5, 0.1),
-    "gravity_cos": Parameter("Nm", 0.01, -1.0, 1.0, 0.0),
-    "gravity_sin": Parameter("Nm", 0.01, -1.0, 1.0, 0.0),
 }
 """Parameters of the model. Beside them it has `start`, rad: the true angle at the first sample."""
-
-_JOINT = ("inertia", "gravity_cos", "gravity_sin")  # of the joint; the others are the drive's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +77,7 @@ def simulate(
       segment: [T] int; at the first sample of each segment the joint is put to its `start` and to rest. None: one.
       blur: rad, width of the dead-band's edges, for a gradient that sees it; 0 is the true model.
     """
-    drive = Actuator(**{name: values[name] for name in PARAMETERS if name not in _JOINT})
+    drive = Actuator(**{name: values[name] for name in PARAMETERS if name != "inertia"})
     count = target.shape[0]
     index = jnp.arange(count * substeps) - latency
     acting = target[jnp.clip(index // substeps, 0)].reshape(count, substeps)
@@ -107,7 +103,6 @@ def simulate(
         reading = (position + values["encoder_bias"], motor(last, position, velocity))
         for substep in range(substeps):
             torque = motor(target_of[substep], position, velocity)
-            torque = torque - (values["gravity_cos"] * jnp.cos(position) + values["gravity_sin"] * jnp.sin(position))
             velocity = velocity + apply_friction(drive, torque, velocity, rate) / rate
             position = position + timestep * velocity
         return (position, velocity), reading
