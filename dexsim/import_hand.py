@@ -18,6 +18,7 @@ import numpy as np
 import trimesh
 import tyro
 
+from dexsim.calibration.press import fingertip_strength
 from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
@@ -25,7 +26,6 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import Direction, orient, tip_of
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import write_hand
-from dexsim.hand.kinematics import fingertip_strength
 from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import check_new, swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp

@@ -26,6 +26,14 @@ def lever_arms(hand: Hand, joint_position: np.ndarray, finger: int, taxel: int |
     return normal @ jacobian
 
 
+def fingertip_strength(hand: Hand, joint_position: np.ndarray) -> np.ndarray:
+    """Largest force [F] N of each fingertip along its taxels' mean normal that leaves every joint within its stall
+    torque: a static press in one posture, without gravity and friction."""
+    share = np.full(hand.num_taxels, 1.0 / hand.num_taxels)
+    arms = np.abs([lever_arms(hand, joint_position, finger, share) for finger in range(hand.num_fingers)])
+    return (hand.torque_limit / np.maximum(arms, 1e-6)).min(-1)
+
+
 def contact_jacobian(
     hand: Hand, joint_position: np.ndarray, finger: int, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import copy
 import mujoco
 import numpy as np
 
+from dexsim.hand.mjcf import quaternion
 from dexsim_real.calibrate.procedure import Placement, placements
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
@@ -134,6 +135,4 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Orientation [4] with x along the normal and z across the finger."""
     y = along - along @ normal * normal
     y /= np.linalg.norm(y)
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.stack([normal, y, np.cross(normal, y)], 1).ravel())
-    return quat
+    return quaternion(np.stack([normal, y, np.cross(normal, y)], 1))

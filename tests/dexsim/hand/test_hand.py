@@ -10,9 +10,10 @@ import pytest
 from paths import DATA
 
 from dexsim import check_hand
+from dexsim.calibration.press import fingertip_strength
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
-from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 
 PUBLISHED = tomllib.loads((DATA / "published_hands.toml").read_text())

@@ -8,10 +8,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dexsim import check_hand, import_hand
+from dexsim.calibration.press import fingertip_strength
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
 from dexsim.hand.folder import write_hand
-from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.posture import find_grasp
 from dexsim.hand.vendor import read_hand
