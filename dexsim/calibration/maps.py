@@ -237,10 +237,6 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand) -> None
         # A stalled XHand joint draws 1.5 A; 16 bits of mA end at 33 A.
         (joints, "current of the full torque by real.gain", scale / np.abs(per_ampere), 0.03, 33.0, "A"),
         (joints, "share of the full torque without current by real.offset", np.abs(idle) / scale, 0.0, 1.0, ""),
-        (joints, "sim.force_max", sim.force_max, 1e-3, 100.0, "N"),  # the whole hand is rated for 80 N
-        (joints, "real.force_max", real.force_max, 1e-3, 100.0, "N"),
-        (joints, "sim.value_max", sim.value_max, 1e-6, 60.0, "Nm"),
-        (joints, "real.value_max", real.value_max, 1e-6, 33.0, "A"),
     )
     for names, quantity, values, low, high, unit in ranges:
         values = np.asarray(values)

@@ -300,8 +300,6 @@ WRONG = [
     ({"sim.gain": 1.0}, "thumb_bend: magnitude of sim.gain = 1: must .* 0.3 Nm/N"),
     ({"real.offset": 5.0}, "thumb_bend: share of the full torque without current"),
     ({"torque_scale": 0.9}, "thumb_bend: torque_scale over the hand's limit = 0.8182"),
-    ({"real.force_max": 1000.0}, "thumb_bend: real.force_max = 1000: .* 100 N"),
-    ({"real.value_max": 100.0}, "thumb_bend: real.value_max = 100: .* 33 A"),
     ({"force_per_count": 1e-9}, "thumb: force_per_count = 1e-09: must be between 0.001 and 1 N"),
     ({"force_per_torque": 0.5}, "thumb: force_per_torque = 0.5: .* N/Nm"),
     # Each line goes with the simulation's of its own direction, but not with the middle of both, which is used.
