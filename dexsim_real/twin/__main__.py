@@ -55,7 +55,7 @@ class TwinArguments(Config):
     folder: Path | None = None
     """Folder for the ports `hand` and `imu` (rotate) and the socket `masks` (grasp); None for a new temporary one."""
     output: Path | None = None
-    """JSON file for results and statistics, written at the end; None writes no file."""
+    """JSON file for the results of the trials, written at the end; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
     plant_model: Path | None = None
@@ -170,8 +170,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             twin.close()
             if arguments.output:
-                report = {"trials": plant.results()[: arguments.trials], "line": dict(twin.line.counts)}
-                cli.write_json(arguments.output, report | {"slipped_s": round(twin.slipped, 3)})
+                trials = plant.results()[: arguments.trials]
+                cli.write_json(arguments.output, {"trials": trials, "slipped_s": round(twin.slipped, 3)})
     return 0
 
 

@@ -28,7 +28,7 @@ from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.wire import CAMERA_RATE, FORCE_PER_COUNT, IMU_RATE, Firmware, ImuFrames, picture
 from dexsim_real.wire.frames import HOST, Command, Frame, decode, palm_address
-from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, LinkCounts, Reply
+from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, Reply
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
@@ -59,7 +59,7 @@ class VirtualPort(HandPort):
 
     def __init__(self, plant: EmulatedHand):
         self.plant, self.firmware = plant, Firmware(plant)
-        self.time, self.counts = 0.0, LinkCounts()
+        self.time, self.sequence = 0.0, 0  # s; number of exchanges
         self.events = sched.scheduler(self.clock)
 
     def connect(self) -> str:
@@ -77,9 +77,8 @@ class VirtualPort(HandPort):
         answer = self.firmware.answer(request)
         assert answer is not None, "the request is addressed to this hand"
         self.wait_until(sent + ROUND_TRIP)
-        self.counts.sent += 1
-        self.counts.answered += 1
-        return Reply(decode(answer.data), sent, self.time, self.counts.sent, generation=1)
+        self.sequence += 1
+        return Reply(decode(answer.data), sent, self.time, self.sequence, generation=1)
 
     def clock(self) -> float:
         """Virtual time in s."""

@@ -16,7 +16,7 @@ import contextlib
 import os
 import socket
 import tty
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -186,7 +186,6 @@ class HandLine:
 
     def __init__(self, terminal: Terminal, firmware: Firmware, catch_up: Callable[[float], None], seed: int = 0):
         self.terminal, self.firmware, self._catch_up = terminal, firmware, catch_up
-        self.counts: Counter[str] = Counter()
         self._rng, self._parser = np.random.default_rng(seed), Parser(frames.HOST_REQUESTS)
         self._tasks: deque[tuple[float, Frame | bytes]] = deque()  # when (s): a request to execute, bytes to send
         self._heard = -np.inf
@@ -202,9 +201,7 @@ class HandLine:
             self._parser.feed(b"", final=True)
         self._heard = now if data else self._heard
         for frame in self._parser.feed(data):
-            self.counts["requests"] += 1
             if self._tasks:  # It cannot listen and talk on one pair of wires.
-                self.counts["ignored"] += 1
                 continue
             extra = rng.uniform(0.0, EXTRA_DELAY) if rng.random() < EXTRA_PROBABILITY else 0.0
             delay = max(PROCESSING + JITTER * rng.standard_normal(), 0.0) + extra
@@ -225,7 +222,6 @@ class HandLine:
         data = answer.encode()
         # From when it was due: a late machine catches up during the transfer.
         start = max(due, now - _on_wire(len(data)) / 2)
-        self.counts["answers"] += 1
         for begin in range(0, len(data), CHUNK):
             chunk = data[begin : begin + CHUNK]
             self._tasks.append((start + _on_wire(begin + len(chunk)), chunk))

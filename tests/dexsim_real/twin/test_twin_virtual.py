@@ -53,7 +53,7 @@ def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand, monkeypa
     assert report["bridge"]["successes"] == run.policy.goals.successes == 0
     assert any(name.startswith("target beyond a limit") for name in run.safety.counts)
     assert abs(controller.ticks * controller.period - 0.5) < 0.15
-    assert run.port.counts.answered == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
+    assert run.port.sequence == pytest.approx(plant.time * RATE, abs=12)  # The tare is not paced.
     assert heard[0] == pytest.approx(0.0096) and np.ptp(np.diff(heard)[40:] - 1 / RATE) < 1e-9
     assert json.loads(json.dumps(report)) == report
 
