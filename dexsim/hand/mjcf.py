@@ -77,8 +77,8 @@ class Pose(NamedTuple):
     taxel_normal: np.ndarray  # [F, N, 3]
 
 
-def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
-    """Poses of T frames from joint angles [T, J] rad, by MuJoCo."""
+def hand_poses(hand: Hand, joint_position: np.ndarray, kind: type = np.float32) -> list[Pose]:
+    """Poses of T frames from joint angles [T, J] rad, by MuJoCo; arrays of a `kind`."""
     model, data = _plant(hand)
     bodies = [model.body(name).id for name in hand.body_names]
     moving = np.flatnonzero(hand.body_joint >= 0)
@@ -92,7 +92,7 @@ def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
         rotation = palm.T @ data.xmat[bodies].reshape(-1, 3, 3)
         tips = rotation[hand.tip_body].swapaxes(-1, -2)
         taxels = position[hand.tip_body, None] + hand.taxel_position @ tips
-        poses.append(Pose(*(x.astype(np.float32) for x in (position, rotation, taxels, hand.taxel_normal @ tips))))
+        poses.append(Pose(*(x.astype(kind) for x in (position, rotation, taxels, hand.taxel_normal @ tips))))
     return poses
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies
-from dexsim.hand.mjcf import disabled, quaternion, read_mjcf
+from dexsim.hand.mjcf import disabled, hand_poses, quaternion, read_mjcf
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF
@@ -183,14 +183,9 @@ def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Po
 
 def _hand_tips(hand: Hand, posture: np.ndarray) -> Pose:
     """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's MJCF."""
-    data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(hand.model_path)))
-    for name, angle in zip(hand.joint_names, posture, strict=True):
-        data.joint(name).qpos[0] = angle
-    mujoco.mj_kinematics(data.model, data)
-    palm, bodies = data.body(hand.palm), [data.model.body(hand.body_names[body]).id for body in hand.tip_body]
-    frame = palm.xmat.reshape(3, 3)
-    turns = frame.T @ data.xmat[bodies].reshape(-1, 3, 3)
-    return (data.xpos[bodies] - palm.xpos) @ frame + np.einsum("fij,fj->fi", turns, hand.tip_offset), turns
+    (pose,) = hand_poses(hand, posture[None], float)
+    turns = pose.body_rotation[hand.tip_body]
+    return pose.body_position[hand.tip_body] + np.einsum("fij,fj->fi", turns, hand.tip_offset), turns
 
 
 def _add_lattices(spec: mujoco.MjSpec, data: mujoco.MjData, hand: Hand, palm: Pose, tips: list[int]) -> list[str]:
