@@ -19,16 +19,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from dexsim.calibration.fit import LEAST_PRESSES, check_signals
+from dexsim.calibration.fit import LEAST_PRESSES
 from dexsim.core.errors import CalibrationError
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 
-MIN_SAMPLES = 200
-MIN_MOTION = 0.02
-"""rad that the joint must have moved."""
-
-_SATURATED = 0.6, 0.97  # share of the samples that may have this share of the largest torque
 _PARTS = 20  # equal stretches of a log
 _NULL = 1e-4  # singular values below this share of the largest are none: the Jacobian is float32
 _CORRELATED, _VAGUE = 0.97, 0.5
@@ -115,10 +110,8 @@ def identify(
       holdout: another recording with the same period, best with other signals, to test on.
 
     Raises:
-      CalibrationError: says what is wrong with the log or what to record.
+      CalibrationError: a name that cannot be fitted, or a first guess out of its bounds.
     """
-    for recording in (log,) if holdout is None else (log, holdout):
-        check_log(recording)
     search = Search(log, start, fit, substeps, dead_band)
     search.run(latencies)
     latency, fitted, count = search.latency, search.names, len(search.names)
@@ -253,23 +246,6 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
     return float(np.sqrt(np.mean((np.asarray(position, float) - log.position) ** 2)))
 
 
-def check_log(log: JointLog) -> None:
-    """Refuse a log that cannot tell. Raises CalibrationError: too short, not numbers, another unit, no motion,
-    saturated throughout."""
-    channels = {"target": (log.target, "rad"), "position": (log.position, "rad")}
-    if log.torque is not None:
-        channels["torque"] = log.torque, "Nm"
-    check_signals(log.name, MIN_SAMPLES, channels, *_SATURATED)
-    if not 1e-4 <= log.period <= 0.2:
-        raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 to 0.2")
-    moved, commanded = np.ptp(log.position), np.ptp(log.target)
-    if min(moved, commanded) < MIN_MOTION or not commanded / 20 < moved < 20 * commanded:
-        raise CalibrationError(
-            f"{log.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {MIN_MOTION} rad of "
-            "motion is needed, target and position in the same unit"
-        )
-
-
 # --- the search -----------------------------------------------------------------------------------
 
 
@@ -321,10 +297,7 @@ def _crowd_costs(data: _Data, crowd: jax.Array, starts: jax.Array, latency: jax.
 class Search:
     """One log's least squares: theta [P] (what is fitted, a dead-band last), the starts [S], and the latency.
 
-    The arguments are those of `identify`, the log is checked.
-
-    Raises:
-      CalibrationError: a name that cannot be fitted, or a first guess out of its bounds.
+    The arguments and errors are those of `identify`.
     """
 
     def __init__(

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.actuator.drive import Actuator, apply_friction, joint_torque, pd_torque, torque_limit
+from dexsim.calibration.fit import check_signals
 from dexsim.core.errors import CalibrationError
 
 
@@ -45,16 +46,36 @@ PARAMETERS = {
 }
 """Parameters of the model. Beside them it has `start`, rad: the true angle at the first sample."""
 
+_SAMPLES, _MOTION = 200, 0.02  # that a log needs; rad that the joint must have moved
+_SATURATED = 0.6, 0.97  # share of the samples that may have this share of the largest torque
+
 
 @dataclasses.dataclass(frozen=True)
 class JointLog:
-    """A recording of one joint that moved alone, a sample every `period` s."""
+    """A recording of one joint that moved alone, a sample every `period` s.
+
+    Raises CalibrationError: it cannot tell, being too short, not numbers, in another unit, without motion or saturated.
+    """
 
     period: float  # s
     target: np.ndarray  # [T] rad, commanded at each sample
     position: np.ndarray  # [T] rad, measured at the same instants
     torque: np.ndarray | None = None  # [T] Nm, of the motor by its calibrated current
     name: str = "joint"
+
+    def __post_init__(self) -> None:
+        channels = {"target": (self.target, "rad"), "position": (self.position, "rad")}
+        if self.torque is not None:
+            channels["torque"] = self.torque, "Nm"
+        check_signals(self.name, _SAMPLES, channels, *_SATURATED)
+        if not 1e-4 <= self.period <= 0.2:
+            raise CalibrationError(f"{self.name}: period of {self.period:g} s: give seconds, from 0.0001 to 0.2")
+        moved, commanded = np.ptp(self.position), np.ptp(self.target)
+        if min(moved, commanded) < _MOTION or not commanded / 20 < moved < 20 * commanded:
+            raise CalibrationError(
+                f"{self.name}: commanded over {commanded:.3g} rad, moved over {moved:.3g} rad: at least {_MOTION} rad "
+                "of motion is needed, target and position in the same unit"
+            )
 
 
 @functools.partial(jax.jit, static_argnames=("substeps", "blur"))
