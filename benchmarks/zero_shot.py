@@ -213,7 +213,7 @@ def draw_losses(folder: Path, hand: Hand, reports: list[dict[str, Any]]) -> list
             object_rotation=matrix(np.array(before["object_quat"])),
             primitive_size=np.array([(*part["size"], 0, 0)[:3] for part in parts]),
             primitive_position=np.array([part["place"] for part in parts]),
-            primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
+            primitive_rotation=np.array([matrix(part["quat"]) for part in parts]),
             primitive_active=np.ones(len(parts), bool),
             taxel_force=np.zeros((hand.num_fingers, hand.num_taxels)),
             command=np.float32(report["command"]),

@@ -62,7 +62,7 @@ class Emulation:
             object_rotation=matrix(quat),
             primitive_size=np.array([(*part.size, 0, 0)[:3] for part in parts]),
             primitive_position=np.array([part.place for part in parts]),
-            primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
+            primitive_rotation=np.array([matrix(part.quat) for part in parts]),
             primitive_active=np.ones(len(parts), bool),
             taxel_force=measured.taxel_force,
             command=np.array(policy.command),

@@ -267,7 +267,7 @@ def outline(part: Primitive) -> np.ndarray:
         ball = part.size[0] * np.concatenate([np.cos(h) * ring + [0, 0, np.sin(h)] for h in heights])
         half = part.size[1] if part.kind == "capsule" else 0.0
         points = ball + np.where(ball[:, 2:] >= 0, half, -half) * [0, 0, 1]
-    return points + part.place
+    return points @ matrix(part.quat).T + part.place
 
 
 def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:

@@ -208,7 +208,7 @@ class EmulatedHand:
         rng = np.random.default_rng([self.seed, self.trial])
         for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
             parameters = sample_trial(self.task, rng, self.kind, self.overrides, self.hand)
-            shape = sample_shape(parameters, rng, self.shape_name)
+            shape = sample_shape(parameters, rng, self.shape_name, self.start.axis)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
             self._palm_face = palm_face(scene, self.start.place[-2:]) if self._model.foreign else own
@@ -256,7 +256,7 @@ class EmulatedHand:
             "parameter_kind": self.kind,
             "plant": self._model.name,
             "shape": self.shape.name,
-            "parts": [{"kind": p.kind, "size": list(p.size), "place": list(p.place)} for p in self.shape.parts],
+            "parts": [{k: v if k == "kind" else list(v) for k, v in vars(part).items()} for part in self.shape.parts],
             "stage": self.stage.value,
             **self._referee.report(),
             "parameters": {name: np.round(value, 6).tolist() for name, value in values.items()},

@@ -91,10 +91,9 @@ def add_object(spec: mujoco.MjSpec, shape: ObjectShape) -> None:
     body.add_freejoint(name="object")
     for k, part in enumerate(shape.parts):
         size = [*part.size, 0.0, 0.0][:3]
-        geom = body.add_geom(name=f"object_{k}", size=size, pos=part.place, density=1.0, contype=0, conaffinity=0)
-        geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.replace('disc', 'cylinder').upper()}")
-        if part.kind == "disc":
-            geom.quat = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # z to x
+        geom = body.add_geom(name=f"object_{k}", size=size, pos=part.place, quat=part.quat, density=1.0)
+        geom.contype = geom.conaffinity = 0
+        geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
 
 
 def set_object(model: mujoco.MjModel, parameters: TrialParameters) -> None:

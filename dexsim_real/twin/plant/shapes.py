@@ -11,22 +11,22 @@ import numpy as np
 from dexsim_real.twin.plant.parameters import TrialParameters
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+_Z_TO_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 BODY_SHARE = 0.8  # size of a composition's body relative to a single body
 
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """A primitive, aligned with the object's axes."""
+    """A primitive at its pose in the object's frame."""
 
-    kind: str  # "sphere", "box", "cylinder", "capsule"; "disc": a cylinder along x
+    kind: str  # "sphere", "box", "cylinder", "capsule"
     size: tuple[float, ...]  # m: radius; half extents; radius, half length
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, centre in the object's frame
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [...] m of points [..., 3] in the object's frame, negative inside."""
-        local = points - self.place
-        if self.kind == "disc":
-            return Primitive("cylinder", self.size).distance(local[..., ::-1])
+        local = (points - self.place) @ matrix(self.quat)
         x, y, z = np.moveaxis(local, -1, 0)
         if self.kind in ("sphere", "capsule"):
             half = self.size[1] if self.kind == "capsule" else 0.0
@@ -39,12 +39,10 @@ class Primitive:
 
     def reach(self, direction: np.ndarray) -> float:
         """Extent in m from the object's origin along a unit direction [3] of its frame."""
-        x, y, z = np.abs(direction)
-        if self.kind == "disc":
-            x, z = z, x
+        x, y, z = np.abs(direction @ matrix(self.quat))
         if self.kind == "box":
             extent = np.dot(self.size, (x, y, z))
-        elif self.kind in ("cylinder", "disc"):
+        elif self.kind == "cylinder":
             extent = self.size[0] * np.hypot(x, y) + self.size[1] * z
         else:
             extent = self.size[0] + (self.size[1] * z if self.kind == "capsule" else 0.0)
@@ -67,15 +65,24 @@ class ObjectShape:
         return max(part.reach(direction) for part in self.parts)
 
 
-def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: str | None = None) -> ObjectShape:
-    """Sample the object of a trial: a cube to rotate, or a box or upright cylinder; to grasp, one of `SHAPES`, or
-    the named one."""
+def sample_shape(
+    parameters: TrialParameters,
+    rng: np.random.Generator,
+    name: str | None = None,
+    axis: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0),
+) -> ObjectShape:
+    """Sample the object of a trial: a cube to rotate, a face of it across `axis`, or a box or upright cylinder; to
+    grasp, one of `SHAPES`, or the named one."""
     which, box_body = rng.choice(SHAPES), rng.random() < 0.5
     if "edge" in parameters.value:
         a, b, c = (parameters.edge / 2 * parameters.value.get("proportions", np.ones(3))).tolist()
         if box_body or "proportions" not in parameters.value:
-            return ObjectShape("box", (Primitive("box", (a, b, c)),))
-        return ObjectShape("cylinder", (Primitive("disc", (b, a)),))
+            # The shortest turn from x to the axis, as in training: the object's frame, whose identity is aligned with
+            # the palm, is not that of the faces.
+            stand = np.array([1 + axis[0], 0.0, -axis[2], axis[1]])
+            w, x, y, z = (stand / np.linalg.norm(stand)).tolist()
+            return ObjectShape("box", (Primitive("box", (a, b, c), quat=(w, x, y, z)),))
+        return ObjectShape("cylinder", (Primitive("cylinder", (b, a), quat=_Z_TO_X),))
     name = name or str(which)
     half = tuple(float(h) for h in parameters.box_half)
     tube = parameters.cylinder_radius, parameters.cylinder_half
@@ -103,7 +110,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
 
 
-def matrix(quat: np.ndarray) -> np.ndarray:
+def matrix(quat: Sequence[float] | np.ndarray) -> np.ndarray:
     """Rotation matrix [3, 3] of a unit quaternion."""
     w, x, y, z = quat
     return np.array(

@@ -1,11 +1,15 @@
 """Objects of the emulated hand against MuJoCo's geometry."""
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
+from dexsim.hand.load import load_hand
+from dexsim.registry import TASKS
+from dexsim.tasks.rotate.start import sample_turned_object
 from dexsim_real.twin.plant import scene, shapes
-from dexsim_real.twin.plant.parameters import sample_trial
+from dexsim_real.twin.plant.parameters import sample_trial, start_of
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 
 
@@ -16,7 +20,8 @@ from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
         Primitive("box", (0.02, 0.03, 0.025)),
         Primitive("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
         Primitive("capsule", (0.015, 0.02)),
-        Primitive("disc", (0.02, 0.03)),
+        Primitive("cylinder", (0.02, 0.03), (0.0, 0.01, 0.0), (0.6, 0.0, 0.8, 0.0)),
+        Primitive("box", (0.02, 0.03, 0.025), (0.0, 0.0, 0.01), (0.5, 0.1, 0.7, 0.5)),
     ],
 )
 def test_distances_agree_with_mujoco(part):
@@ -37,7 +42,7 @@ def test_distances_agree_with_mujoco(part):
     along = np.array([0.6, 0.0, 0.8])
     fine = np.random.default_rng(0).uniform(-0.06, 0.06, (200_000, 3))
     inside = fine[ObjectShape("x", (part,)).distance(fine) < 0]
-    assert ObjectShape("x", (part,)).reach(along) == pytest.approx((inside @ along).max(), abs=2e-3)
+    assert ObjectShape("x", (part,)).reach(along) == pytest.approx((inside @ along).max(), abs=3e-3)
 
 
 def test_mass_properties_of_a_box():
@@ -61,4 +66,14 @@ def test_all_shapes_are_drawn_and_for_rotate_any_boxes_and_upright_cylinders():
     sizes = np.concatenate([part.size for shape in drawn for part in shape.parts])
     assert {shape.name for shape in drawn} == {"box", "cylinder"}
     assert 0.9 * 0.045 / 2 <= sizes.min() < 0.022 and 0.032 < sizes.max() <= 1.1 * 0.065 / 2
-    assert {shape.parts[0].kind for shape in drawn} == {"box", "disc"}
+
+
+@pytest.mark.parametrize("task", ["rotate", "rotate_any", "rotate_clear"])
+def test_faces_lie_in_the_frame_of_the_object_as_in_training(task):
+    """The policy sees this frame: cubes that stood otherwise in it did not turn."""
+    trained = sample_turned_object(jax.random.key(0), TASKS[task].config())
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(trained.kinds), 1)) if trained.quat is None else trained.quat
+    axis, parameters = start_of(load_hand(), task).axis, sample_trial(task, np.random.default_rng(0))
+    for k in range(10):
+        (part,) = shapes.sample_shape(parameters, np.random.default_rng(k), None, axis).parts
+        assert part.quat == pytest.approx(quats[trained.kinds.index(part.kind)], abs=1e-6)
