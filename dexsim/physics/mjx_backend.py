@@ -10,16 +10,19 @@ H = M - J^T f' J is the Hessian of the solver's convex problem.
 """
 
 import contextlib
+import io
 from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from dexsim.core.errors import AssetError
 from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, configured
+
+with contextlib.redirect_stdout(io.StringIO()):  # It prints that Warp is missing, which nothing here uses.
+    from mujoco import mjx
 
 
 class MjxBackend:

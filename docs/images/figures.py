@@ -25,7 +25,7 @@ import dexsim
 from dexsim.core import cli
 from dexsim.core.config import from_dict, override
 from dexsim.render.render import render_frame
-from dexsim_ppo import evaluate, load_policy
+from dexsim_ppo import evaluate, load_policy, record
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES, RESULTS = ROOT / "docs" / "images", ROOT / "docs" / "results"
@@ -55,6 +55,13 @@ def films() -> None:
         print(f"film of {name}", flush=True)
         options = ["--episodes", "64", "--no-baseline", "--seconds", f"{seconds}", "--set", *settings]
         evaluate.main([policy, *options, "--video", str(IMAGES / f"{name}.mp4")])
+
+
+def episodes() -> None:
+    """What `dexsim demo` shows where there is no JAX."""
+    for name, count in {"grasp": 4, "rotate": 2, "rotate_clear": 2, "rotate_without_orientation": 2}.items():
+        file = ROOT / "assets" / "episodes" / f"{name}.npz"
+        record.main([name, "--npz", str(file), "--episodes", str(count)])
 
 
 def view() -> None:
@@ -240,7 +247,10 @@ def objects() -> None:
     (RESULTS / "figures" / "objects.jpg").write_bytes(buffer.getvalue())
 
 
-MAKERS = {maker.__name__: maker for maker in (tables, robustness, skin, calibration, objects, view, animation, films)}
+MAKERS = {
+    maker.__name__: maker
+    for maker in (tables, robustness, skin, calibration, objects, view, animation, films, episodes)
+}
 
 
 def main() -> None:
