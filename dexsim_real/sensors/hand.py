@@ -216,9 +216,7 @@ class HandSensing:
         """
         on, (kp, ki, kd), current = mode == Mode.POSITION, self._gains, self.config.torque_max
         reported, share = (np.asarray(position) - self._offset) * self._sign, stiffness * on
-        block = frames.command_block(
-            reported, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on, mode=mode
-        )
+        block = frames.command_block(reported, mode, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on)
         if not np.isfinite(block["position"]).all():
             raise HandError("a command is not finite; it was not sent")
         return block
