@@ -120,7 +120,7 @@ class HandSensing:
         self._sign, self._offset = sign.astype(np.float32), offset.astype(np.float32)
         self.tare = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._tared, self._advised = self.tare, np.zeros(hand.num_fingers, bool)
-        self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
+        self._tracker = TaxelTracker(hand, config.tare_sum)
         if calibration is None:
             self._per_count = np.full((hand.num_fingers, 1), config.force_per_count, np.float32)
             scale = np.float32(config.current_sign / config.current_scale)
@@ -180,14 +180,12 @@ class HandSensing:
         `limit` N is the largest force of a finger. Returns whether `tare` has changed, and lines about masked taxels
         and zeros that have moved far. Raises HandError: many taxels of a fingertip are stuck.
         """
-        before, lines, counts = self.tare, list[str](), self.counts(state)
-        stuck = self._stuck.find(np.maximum(counts - before, 0.0), limit / self._per_count)
-        if stuck.any():
-            self.tare = np.where(stuck, np.float32(np.inf), before)
-            check_masked(self.hand, np.isinf(self.tare))
-            lines = self._say_masked(stuck)
-        self.tare = self._zero.update(time, counts, self.tare)
-        return not np.array_equal(self.tare, before), lines + self._say_wandered()
+        before = self.tare
+        self.tare = self._tracker.update(time, self.counts(state), before, limit / self._per_count)
+        masked = np.isinf(self.tare)
+        check_masked(self.hand, masked)
+        lines = self._say_masked(masked & np.isfinite(before)) + self._say_wandered()
+        return not np.array_equal(self.tare, before), lines
 
     def _say_masked(self, stuck: np.ndarray) -> list[str]:
         return [
@@ -283,33 +281,16 @@ def around(hand: Hand, values: np.ndarray) -> np.ndarray:
     return ndimage.convolve(lattice, _NEIGHBOURS, mode="constant").reshape(values.shape)
 
 
-class StuckTaxels:
-    """Finds taxels that get stuck in a run: above what a finger may press, the same for 20 answers, and nothing else on
-    the fingertip reads anything.
-
-    Beside a load a taxel may also saturate. A real load of that size makes `Safety` ease it, which changes the reading;
-    what is stuck stays until the fingertip is free.
-    """
-
-    def __init__(self, hand: Hand):
-        self._first = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)  # counts
-        self._answers = np.zeros(self._first.shape, int)
-
-    def find(self, counts: np.ndarray, limit: np.ndarray) -> np.ndarray:
-        """Mask [F, N] of stuck taxels, given each answer's tared counts [F, N] and what a finger may read [F, 1]."""
-        same = (counts > limit) & (np.abs(counts - self._first) <= _SAME)
-        self._first = np.where(same, self._first, counts)
-        others = np.where(same, 0.0, counts).max(1, keepdims=True)
-        self._answers = np.where(same & (others <= _QUIET), self._answers + 1, 0)
-        return self._answers >= _ANSWERS
-
-
-class ZeroTracker:
-    """Follows the zeros of a run's taxels, which wander over minutes, as the fingertips warm up.
+class TaxelTracker:
+    """Follows the zeros of a run's taxels, which wander over minutes, as the fingertips warm up, and finds stuck ones.
 
     What a free taxel reads on average is its new zero. Light touches look the same to a single taxel, so the zeros of a
     fingertip rise together no faster than they wander with temperature, and to `most` counts: the largest load that
     they can hide.
+
+    A taxel is stuck that reads more than a finger may press, the same for 20 answers, while nothing else on the
+    fingertip reads anything. Beside a load it may also saturate. A real load of that size makes `Safety` ease it, which
+    changes the reading; what is stuck stays until the fingertip is free.
     """
 
     def __init__(self, hand: Hand, most: float):
@@ -318,9 +299,17 @@ class ZeroTracker:
         self._budget = np.full(hand.num_fingers, _FIRST)  # counts by which the zeros of a fingertip may rise now
         self._sum = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._answers, self._begin = np.zeros(self._sum.shape, int), np.zeros(self._sum.shape)
+        self._first, self._same = np.zeros_like(self._sum), np.zeros_like(self._answers)  # tared counts; answers
 
-    def update(self, time: float, counts: np.ndarray, zero: np.ndarray) -> np.ndarray:
-        """Update with raw counts [F, N] at a time in s; the zeros [F, N], infinite for stuck taxels, which stay so."""
+    def update(self, time: float, counts: np.ndarray, zero: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """Update with raw counts [F, N] at a time in s; the zeros [F, N], infinite for stuck taxels, which stay so.
+        `limit` [F, 1] is how many tared counts a finger may press."""
+        tared = np.maximum(counts - zero, 0.0)
+        same = (tared > limit) & (np.abs(tared - self._first) <= _SAME)
+        self._first = np.where(same, self._first, tared)
+        others = np.where(same, 0.0, tared).max(1, keepdims=True)
+        self._same = np.where(same & (others <= _QUIET), self._same + 1, 0)
+        zero = np.where(self._same >= _ANSWERS, np.float32(np.inf), zero)
         if self._time is None:
             self._begin[:], self._time = time, time
         self._budget = np.minimum(self._budget + _RATE * (time - self._time), _AT_ONCE)
