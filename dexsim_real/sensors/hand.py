@@ -1,4 +1,4 @@
-"""From reported values to SI units: calibration, filtered velocities, and the zeros of the taxels.
+"""From reported values to SI units: calibration, and the zeros of the taxels.
 
 The skin spreads every load over adjacent taxels. So a taxel that reads much while the rest of its fingertip reads next
 to nothing is stuck, and one that stays near its zero beside neighbours that do so bears nothing.
@@ -18,7 +18,6 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
-_VELOCITY_TIME = 0.02  # s, time constant of the filter on differences of the joint angle
 _WANDERED = 30.0  # counts by which a fingertip's zero may move before a new tare is advised: 3 N by the vendor's 0.1 N
 
 _HIGH = 40.0  # counts above which a taxel cannot be tared: alone it is stuck, several adjacent ones touch something
@@ -76,13 +75,6 @@ class HardwareConfig(Config):
         if any(abs(sign) != 1.0 for sign in self.joint_sign):
             raise HandError("HardwareConfig.joint_sign: every value must be 1 or -1")
 
-    def per_joint(self, name: str, joints: int) -> np.ndarray:
-        """A setting for each joint [J]. HandError: it has neither one value nor one a joint."""
-        values = getattr(self, name)
-        if len(values) not in (1, joints):
-            raise HandError(f"HardwareConfig.{name}: {len(values)} values for {joints} joints")
-        return np.broadcast_to(np.array(values), joints)
-
 
 @dataclasses.dataclass(frozen=True)
 class HandMeasurement:
@@ -115,8 +107,11 @@ class HandSensing:
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         self.hand, self.config, self.calibration = hand, config, calibration
-        names, joints = ("joint_sign", "joint_offset", "kp", "ki", "kd"), hand.num_joints
-        sign, offset, *self._gains = (config.per_joint(name, joints) for name in names)
+        given = {name: getattr(config, name) for name in ("joint_sign", "joint_offset", "kp", "ki", "kd")}
+        for name, values in given.items():
+            if len(values) not in (1, hand.num_joints):
+                raise HandError(f"HardwareConfig.{name}: {len(values)} values for {hand.num_joints} joints")
+        sign, offset, *self._gains = (np.broadcast_to(np.array(values), hand.num_joints) for values in given.values())
         self._sign, self._offset = sign.astype(np.float32), offset.astype(np.float32)
         self.tare = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._tared, self._advised = self.tare, np.zeros(hand.num_fingers, bool)
@@ -225,14 +220,6 @@ class HandSensing:
         if self.config.taxel_axes == "z":
             return taxel["z"].astype(np.float32)
         return np.sqrt(sum(taxel[axis].astype(np.float32) ** 2 for axis in "xyz"))
-
-
-def filtered_velocity(velocity: np.ndarray, moved: np.ndarray, seconds: float) -> np.ndarray:
-    """Joint velocities [J] rad/s by a first-order filter, from those before and the motion [J] rad in a time in s."""
-    if seconds <= 0:
-        return velocity
-    weight = seconds / (seconds + _VELOCITY_TIME)
-    return (velocity + weight * (moved / seconds - velocity)).astype(np.float32)
 
 
 # --- taxels at rest and in a run --------------------------------------------------------------------
