@@ -93,10 +93,6 @@ class HandMeasurement:
         """Force [F] N of each fingertip."""
         return self.taxel_force.sum(-1)
 
-    def finite(self) -> bool:
-        """Whether angles, torques and forces are finite."""
-        return all(np.isfinite(part).all() for part in (self.joint_position, self.joint_torque, self.taxel_force))
-
 
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.

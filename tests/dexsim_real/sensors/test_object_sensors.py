@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import os
 import time
+import tty
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,9 +196,6 @@ def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():
 
 def test_the_imu_thread_reads_a_port():
     pytest.importorskip("serial")
-    import os
-    import tty
-
     master, slave = os.openpty()
     tty.setraw(slave)
     part = imu.Imu(os.ttyname(slave))
