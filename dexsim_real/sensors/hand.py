@@ -160,10 +160,22 @@ class HandSensing:
         something, or has many stuck taxels.
         """
         counts = np.asarray(np.mean([self.counts(state) for state in states], axis=0, dtype=np.float32))
-        stuck = judge_rest(self.hand, counts, self.config.tare_sum)
-        self.tare = self._tared = np.where(stuck, np.float32(np.inf), counts)
+        high, most = counts > _HIGH, self.config.tare_sum
+        beside = around(self.hand, high)
+        total = np.where(high, 0.0, counts).sum(1)  # Stuck taxels do not add to it.
+        for finger, name in enumerate(self.hand.finger_names):
+            patch = high[finger] & (beside[finger] > 0)
+            if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
+                what = f"{patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts"
+                raise HandError(f"cannot tare the taxels: {what}: something touches it; free the fingertips")
+            if total[finger] > most:
+                what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
+                todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
+                raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
+        lines = self._say_masked(high, high)
+        self.tare = self._tared = np.where(high, np.float32(np.inf), counts)
         self._advised[:] = False
-        return self._say_masked(stuck)
+        return lines
 
     def follow_taxels(self, time: float, state: np.ndarray, limit: float) -> tuple[bool, list[str]]:
         """Mask taxels that have got stuck and follow the zeros of those that touch nothing, by every answer of a run.
@@ -173,17 +185,21 @@ class HandSensing:
         """
         before = self.tare
         self.tare = self._tracker.update(time, self.counts(state), before, limit / self._per_count)
-        masked = np.isinf(self.tare)
-        check_masked(self.hand, masked)
-        lines = self._say_masked(masked & np.isfinite(before)) + self._say_wandered()
-        return not np.array_equal(self.tare, before), lines
+        new = np.isinf(self.tare) & np.isfinite(before)
+        lines = self._say_masked(np.isinf(self.tare), new) if new.any() else []
+        return not np.array_equal(self.tare, before), lines + self._say_wandered()
 
-    def _say_masked(self, stuck: np.ndarray) -> list[str]:
-        return [
-            f"{name}: stuck and read as 0 from now on: taxel {taxel_names(self.hand, which)}"
-            for name, which in zip(self.hand.finger_names, stuck, strict=True)
-            if which.any()
-        ]
+    def _say_masked(self, masked: np.ndarray, new: np.ndarray) -> list[str]:
+        """A line for each fingertip with newly masked taxels. HandError: one has so many masked taxels that no limit
+        would follow its force."""
+        lines = list[str]()
+        for name, every, fresh in zip(self.hand.finger_names, masked, new, strict=True):
+            if every.sum() > _MANY:
+                text = f"{every.sum()} taxels are stuck: {taxel_names(self.hand, every)}"
+                raise HandError(f"{name}: {text}; power-cycle the hand")
+            if fresh.any():
+                lines.append(f"{name}: stuck and read as 0 from now on: taxel {taxel_names(self.hand, fresh)}")
+        return lines
 
     def _say_wandered(self) -> list[str]:
         """A line, once, for each fingertip whose zeros have moved far since they were tared."""
@@ -218,37 +234,7 @@ class HandSensing:
         return np.sqrt(sum(taxel[axis].astype(np.float32) ** 2 for axis in "xyz"))
 
 
-# --- taxels at rest and in a run --------------------------------------------------------------------
-
-
-def judge_rest(hand: Hand, counts: np.ndarray, most: float) -> np.ndarray:
-    """Mask [F, N] of stuck taxels, given mean raw counts [F, N] of fingertips that should touch nothing.
-
-    `most` is the sum of a fingertip's counts above which it is touched; stuck taxels do not add to it. Raises
-    HandError: something touches a fingertip, or many of its taxels are stuck.
-    """
-    high = counts > _HIGH
-    beside = around(hand, high)
-    total = np.where(high, 0.0, counts).sum(1)
-    for finger, name in enumerate(hand.finger_names):
-        patch = high[finger] & (beside[finger] > 0)
-        if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
-            what = f"{patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts"
-            raise HandError(f"cannot tare the taxels: {what}: something touches it; free the fingertips")
-        if total[finger] > most:
-            what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
-            todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
-            raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
-    check_masked(hand, high)
-    return high
-
-
-def check_masked(hand: Hand, stuck: np.ndarray) -> None:
-    """Raises HandError: a fingertip has so many stuck taxels [F, N] that no limit would follow its force."""
-    for name, which in zip(hand.finger_names, stuck, strict=True):
-        if which.sum() > _MANY:
-            text = f"{which.sum()} taxels are stuck: {taxel_names(hand, which)}"
-            raise HandError(f"{name}: {text}; power-cycle the hand")
+# --- taxels in a run --------------------------------------------------------------------------------
 
 
 def taxel_names(hand: Hand, which: np.ndarray) -> str:
