@@ -159,10 +159,6 @@ class ObjectSensors:
     camera: HeightSensor | None = None
     imu: ImuReader | None = None
 
-    def __post_init__(self) -> None:
-        self._place = np.asarray(self.reference, float)
-        self._down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
-
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
 
@@ -178,9 +174,10 @@ class ObjectSensors:
 
     def read(self, now: float) -> tuple[ObjectEstimate, float]:
         """The estimate, and the time in s of the newest orientation."""
-        position, velocity = self.camera.newest[1:] if self.camera else (self._place, np.zeros(3))
+        position, velocity = self.camera.newest[1:] if self.camera else (np.asarray(self.reference), np.zeros(3))
         if not self.imu:
-            return ObjectEstimate(position, velocity, IDENTITY, self._down), now
+            down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
+            return ObjectEstimate(position, velocity, IDENTITY, down), now
         when, quat = self.imu.read()
         return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
 

@@ -103,6 +103,7 @@ class HandSensing:
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         self.hand, self.config, self.calibration = hand, config, calibration
+        self.block = frames.driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)  # of a driver's states
         given = {name: getattr(config, name) for name in ("joint_sign", "joint_offset", "kp", "ki", "kd")}
         for name, values in given.items():
             if len(values) not in (1, hand.num_joints):
@@ -119,11 +120,6 @@ class HandSensing:
         else:
             self._per_count = np.asarray(calibration.force_per_count, np.float32)[:, None]
             self._torque = jax.jit(lambda milliamperes: normalised_torque(calibration, milliamperes * np.float32(1e-3)))
-
-    @property
-    def block(self) -> np.dtype:
-        """The state block of this hand with a driver of its own."""
-        return frames.driver_block(self.hand.num_joints, self.hand.num_fingers, self.hand.num_taxels)
 
     def decode(self, data: bytes) -> np.ndarray:
         """A logged state: of the XHand's wire, or of a driver. HandError: it is of another hand."""
