@@ -20,12 +20,13 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import EXCHANGE, change_priority, ignore_signals
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, filtered_velocity
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import Mode, passive_command
 from dexsim_real.wire.link import BRIEF, PATIENCE, HandPort, LinkConfig, Reply
 
 TARE_SAMPLES = 30
 _TARE = 5.0  # s in which they must arrive
+_SMOOTH = 0.02  # s, time constant of the filter on differences of the joint angle
 _BIN, _BINS = 1e-5, 5000  # s and number: the histogram ends at 50 ms
 GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
@@ -145,8 +146,10 @@ class ExchangeLoop:
         measured = self.sensing.measure(reply.state)
         last, velocity = self.safety.sample, np.zeros(self.sensing.hand.num_joints, np.float32)
         if last is not None and last.generation == reply.generation:
-            moved = measured.joint_position - last.measured.joint_position
-            velocity = filtered_velocity(last.velocity, moved, reply.received - last.time)
+            velocity, seconds = last.velocity, reply.received - last.time
+            if seconds > 0:
+                weight, moved = seconds / (seconds + _SMOOTH), measured.joint_position - last.measured.joint_position
+                velocity = (velocity + weight * (moved / seconds - velocity)).astype(np.float32)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity, reply.state)
 
 

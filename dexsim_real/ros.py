@@ -25,7 +25,6 @@ from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import setting
-from dexsim.hand.description import Hand
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.control.guard import Guard
 from dexsim_real.control.limits import SafetyConfig
@@ -123,9 +122,10 @@ class HandNode:
         self._joints.publish(joints)
         if "taxels" in self.port.missing:
             return
-        for publisher, body, parts in zip(
-            self._wrenches, hand.tip_body, tip_wrenches(hand, measured.taxel_force), strict=True
-        ):
+        pressed = -measured.taxel_force[..., None] * hand.taxel_normal  # along the inward normals
+        # Force N and torque Nm [F, 2, 3] on each fingertip about the origin of its body.
+        wrenches = np.stack([pressed, np.cross(hand.taxel_position, pressed)], 1).sum(2).astype(float)
+        for publisher, body, parts in zip(self._wrenches, hand.tip_body, wrenches, strict=True):
             wrench = self._wrench()
             wrench.header.stamp, wrench.header.frame_id = stamp, hand.body_names[body]
             for vector, values in zip((wrench.wrench.force, wrench.wrench.torque), parts, strict=True):
@@ -133,13 +133,6 @@ class HandNode:
             publisher.publish(wrench)
         self._array.data = measured.taxel_force.ravel().tolist()
         self._taxels.publish(self._array)
-
-
-def tip_wrenches(hand: Hand, taxel_force: np.ndarray) -> np.ndarray:
-    """Force N and torque Nm [F, 2, 3] on each fingertip about the origin of its body: taxels press along their inward
-    normals."""
-    force = -taxel_force[..., None] * hand.taxel_normal
-    return np.stack([force, np.cross(hand.taxel_position, force)], 1).sum(2).astype(float)
 
 
 def main(argv: Any = None) -> int:

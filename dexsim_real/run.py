@@ -243,7 +243,8 @@ class Session:
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
         guard = Guard(arguments.port, arguments.link, hand) if guarded else None
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
-        self.port = open_port(arguments.port, hand, arguments.link, self._tap)
+        self.port = open_port(arguments.port, hand, arguments.link)
+        self.port.tap = self._tap
         self.controller = Controller(policy, calibrated_hand(hand, calibration))
         self.controller.check_measured(self.port.missing)
         self.sensing = HandSensing(hand, arguments.hardware, calibration)

@@ -250,10 +250,10 @@ class PolicyLoop:
         if now > ready + _PATIENCE:
             options = "--optics.hsv-low, --optics.hsv-high, --optics.min-area"
             raise HandError(f"the camera does not see the object; check the light, {options}")
-        posture = self.controller.spec.posture if self.approach_seconds > 0 else None
-        goal = self._start if posture is None else np.asarray(posture, np.float32)
-        share = min((now - self._begin) / self.approach_seconds, 1.0) if self.approach_seconds > 0 else 1.0
-        self.safety.set_target(smooth(self._start, goal, share), now)
+        target, posture = self._start, np.asarray(self.controller.spec.posture, np.float32)
+        if self.approach_seconds > 0 and posture.size:
+            target = smooth(self._start, posture, min((now - self._begin) / self.approach_seconds, 1.0))
+        self.safety.set_target(target, now)
         return True
 
     def begin(self) -> None:

@@ -129,8 +129,9 @@ class Safety:
                 self._pose.release()
         self._generation, self._confirmed = sample.generation, self._commanded
         measured = sample.measured
+        numbers = measured.joint_position, measured.joint_torque, measured.taxel_force
         self.problem = "not finite"
-        if measured.finite():
+        if all(np.isfinite(part).all() for part in numbers):
             self.problem = self._pose.judge(sample.time, measured.joint_position, self._commanded)
         if self.problem:
             self.counts["implausible: measurement"] += 1

@@ -6,6 +6,7 @@ stream from another program.
 """
 
 import dataclasses
+import math
 import socket
 import struct
 import threading
@@ -99,32 +100,26 @@ class HeightSensor:
             raise HandError(f"the policy observes the object's coordinates {axes}, and a camera measures one")
         self._masks, self._config, self._weight = masks, config, spec.velocity_filter
         self._reference, self._axis = np.asarray(spec.reference, float), axes.index(True)
-        self.newest: tuple[float, np.ndarray, np.ndarray] | None = None
-        """What `read` gives; None before the object was seen."""
+        self.newest = -math.inf, self._reference, np.zeros(3)
+        """Time of the newest measurement (s, monotonic clock; -inf before the object was seen), position [3] m and
+        filtered velocity [3] m/s."""
         self.failure = ""  # why no picture comes any more
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vision", daemon=True)
         self._thread.start()
 
-    def read(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Time of the newest measurement (s, monotonic clock), position [3] m and filtered velocity [3] m/s."""
-        assert self.newest is not None, "wait until the object was seen"
-        return self.newest
-
     def update(self, when: float, mask: np.ndarray) -> None:
         """Update with the mask of a picture taken at a time in s; one no newer than the newest says nothing new."""
-        if self.newest is not None and when <= self.newest[0]:
+        before, place, velocity = self.newest
+        if when <= before:
             return
         height = height_of(mask, self._config, self._reference, self._axis)
         if height is None:
             return
         position = self._reference.copy()
         position[self._axis] = height
-        velocity = np.zeros(3)
-        if self.newest is not None:
-            before, place, velocity = self.newest
-            velocity = velocity + self._weight * ((position - place) / (when - before) - velocity)
-        self.newest = when, position, velocity
+        # The first one has a velocity of 0: its difference took for ever.
+        self.newest = when, position, velocity + self._weight * ((position - place) / (when - before) - velocity)
 
     def close(self) -> None:
         self._stop.set()
@@ -164,16 +159,12 @@ class ObjectSensors:
     camera: HeightSensor | None = None
     imu: ImuReader | None = None
 
-    def __post_init__(self) -> None:
-        self._place = np.asarray(self.reference, float)
-        self._down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
-
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.
 
         Raises HandError: no picture will come any more.
         """
-        if self.camera and self.camera.newest is None:
+        if self.camera and math.isinf(self.camera.newest[0]):
             if self.camera.failure:
                 raise HandError(self.camera.failure)
             return False
@@ -183,15 +174,16 @@ class ObjectSensors:
 
     def read(self, now: float) -> tuple[ObjectEstimate, float]:
         """The estimate, and the time in s of the newest orientation."""
-        position, velocity = self.camera.read()[1:] if self.camera else (self._place, np.zeros(3))
+        position, velocity = self.camera.newest[1:] if self.camera else (np.asarray(self.reference), np.zeros(3))
         if not self.imu:
-            return ObjectEstimate(position, velocity, IDENTITY, self._down), now
+            down = np.asarray(self.gravity) / np.linalg.norm(self.gravity)
+            return ObjectEstimate(position, velocity, IDENTITY, down), now
         when, quat = self.imu.read()
         return ObjectEstimate(position, velocity, quat, self.imu.palm_gravity), when
 
     def lost(self, now: float, limit: float) -> str:
         """Why a measurement is older than `limit` s, or its sensor is not to be trusted; empty if all is well."""
-        if self.camera and now - self.camera.read()[0] > limit:
+        if self.camera and now - self.camera.newest[0] > limit:
             return self.camera.failure or "the object is out of sight"
         if self.imu and self.imu.jumped:
             return "the orientation that the IMU sends has jumped"

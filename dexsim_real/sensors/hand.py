@@ -1,4 +1,4 @@
-"""From reported values to SI units: calibration, filtered velocities, and the zeros of the taxels.
+"""From reported values to SI units: calibration, and the zeros of the taxels.
 
 The skin spreads every load over adjacent taxels. So a taxel that reads much while the rest of its fingertip reads next
 to nothing is stuck, and one that stays near its zero beside neighbours that do so bears nothing.
@@ -18,7 +18,6 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
-_VELOCITY_TIME = 0.02  # s, time constant of the filter on differences of the joint angle
 _WANDERED = 30.0  # counts by which a fingertip's zero may move before a new tare is advised: 3 N by the vendor's 0.1 N
 
 _HIGH = 40.0  # counts above which a taxel cannot be tared: alone it is stuck, several adjacent ones touch something
@@ -76,13 +75,6 @@ class HardwareConfig(Config):
         if any(abs(sign) != 1.0 for sign in self.joint_sign):
             raise HandError("HardwareConfig.joint_sign: every value must be 1 or -1")
 
-    def per_joint(self, name: str, joints: int) -> np.ndarray:
-        """A setting for each joint [J]. HandError: it has neither one value nor one a joint."""
-        values = getattr(self, name)
-        if len(values) not in (1, joints):
-            raise HandError(f"HardwareConfig.{name}: {len(values)} values for {joints} joints")
-        return np.broadcast_to(np.array(values), joints)
-
 
 @dataclasses.dataclass(frozen=True)
 class HandMeasurement:
@@ -101,10 +93,6 @@ class HandMeasurement:
         """Force [F] N of each fingertip."""
         return self.taxel_force.sum(-1)
 
-    def finite(self) -> bool:
-        """Whether angles, torques and forces are finite."""
-        return all(np.isfinite(part).all() for part in (self.joint_position, self.joint_torque, self.taxel_force))
-
 
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
@@ -115,12 +103,16 @@ class HandSensing:
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         self.hand, self.config, self.calibration = hand, config, calibration
-        names, joints = ("joint_sign", "joint_offset", "kp", "ki", "kd"), hand.num_joints
-        sign, offset, *self._gains = (config.per_joint(name, joints) for name in names)
+        self.block = frames.driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)  # of a driver's states
+        given = {name: getattr(config, name) for name in ("joint_sign", "joint_offset", "kp", "ki", "kd")}
+        for name, values in given.items():
+            if len(values) not in (1, hand.num_joints):
+                raise HandError(f"HardwareConfig.{name}: {len(values)} values for {hand.num_joints} joints")
+        sign, offset, *self._gains = (np.broadcast_to(np.array(values), hand.num_joints) for values in given.values())
         self._sign, self._offset = sign.astype(np.float32), offset.astype(np.float32)
         self.tare = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._tared, self._advised = self.tare, np.zeros(hand.num_fingers, bool)
-        self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
+        self._tracker = TaxelTracker(hand, config.tare_sum)
         if calibration is None:
             self._per_count = np.full((hand.num_fingers, 1), config.force_per_count, np.float32)
             scale = np.float32(config.current_sign / config.current_scale)
@@ -128,11 +120,6 @@ class HandSensing:
         else:
             self._per_count = np.asarray(calibration.force_per_count, np.float32)[:, None]
             self._torque = jax.jit(lambda milliamperes: normalised_torque(calibration, milliamperes * np.float32(1e-3)))
-
-    @property
-    def block(self) -> np.dtype:
-        """The state block of this hand with a driver of its own."""
-        return frames.driver_block(self.hand.num_joints, self.hand.num_fingers, self.hand.num_taxels)
 
     def decode(self, data: bytes) -> np.ndarray:
         """A logged state: of the XHand's wire, or of a driver. HandError: it is of another hand."""
@@ -169,10 +156,22 @@ class HandSensing:
         something, or has many stuck taxels.
         """
         counts = np.asarray(np.mean([self.counts(state) for state in states], axis=0, dtype=np.float32))
-        stuck = judge_rest(self.hand, counts, self.config.tare_sum)
-        self.tare = self._tared = np.where(stuck, np.float32(np.inf), counts)
+        high, most = counts > _HIGH, self.config.tare_sum
+        beside = around(self.hand, high)
+        total = np.where(high, 0.0, counts).sum(1)  # Stuck taxels do not add to it.
+        for finger, name in enumerate(self.hand.finger_names):
+            patch = high[finger] & (beside[finger] > 0)
+            if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
+                what = f"{patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts"
+                raise HandError(f"cannot tare the taxels: {what}: something touches it; free the fingertips")
+            if total[finger] > most:
+                what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
+                todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
+                raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
+        lines = self._say_masked(high, high)
+        self.tare = self._tared = np.where(high, np.float32(np.inf), counts)
         self._advised[:] = False
-        return self._say_masked(stuck)
+        return lines
 
     def follow_taxels(self, time: float, state: np.ndarray, limit: float) -> tuple[bool, list[str]]:
         """Mask taxels that have got stuck and follow the zeros of those that touch nothing, by every answer of a run.
@@ -180,21 +179,23 @@ class HandSensing:
         `limit` N is the largest force of a finger. Returns whether `tare` has changed, and lines about masked taxels
         and zeros that have moved far. Raises HandError: many taxels of a fingertip are stuck.
         """
-        before, lines, counts = self.tare, list[str](), self.counts(state)
-        stuck = self._stuck.find(np.maximum(counts - before, 0.0), limit / self._per_count)
-        if stuck.any():
-            self.tare = np.where(stuck, np.float32(np.inf), before)
-            check_masked(self.hand, np.isinf(self.tare))
-            lines = self._say_masked(stuck)
-        self.tare = self._zero.update(time, counts, self.tare)
+        before = self.tare
+        self.tare = self._tracker.update(time, self.counts(state), before, limit / self._per_count)
+        new = np.isinf(self.tare) & np.isfinite(before)
+        lines = self._say_masked(np.isinf(self.tare), new) if new.any() else []
         return not np.array_equal(self.tare, before), lines + self._say_wandered()
 
-    def _say_masked(self, stuck: np.ndarray) -> list[str]:
-        return [
-            f"{name}: stuck and read as 0 from now on: taxel {taxel_names(self.hand, which)}"
-            for name, which in zip(self.hand.finger_names, stuck, strict=True)
-            if which.any()
-        ]
+    def _say_masked(self, masked: np.ndarray, new: np.ndarray) -> list[str]:
+        """A line for each fingertip with newly masked taxels. HandError: one has so many masked taxels that no limit
+        would follow its force."""
+        lines = list[str]()
+        for name, every, fresh in zip(self.hand.finger_names, masked, new, strict=True):
+            if every.sum() > _MANY:
+                text = f"{every.sum()} taxels are stuck: {taxel_names(self.hand, every)}"
+                raise HandError(f"{name}: {text}; power-cycle the hand")
+            if fresh.any():
+                lines.append(f"{name}: stuck and read as 0 from now on: taxel {taxel_names(self.hand, fresh)}")
+        return lines
 
     def _say_wandered(self) -> list[str]:
         """A line, once, for each fingertip whose zeros have moved far since they were tared."""
@@ -216,9 +217,7 @@ class HandSensing:
         """
         on, (kp, ki, kd), current = mode == Mode.POSITION, self._gains, self.config.torque_max
         reported, share = (np.asarray(position) - self._offset) * self._sign, stiffness * on
-        block = frames.command_block(
-            reported, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on, mode=mode
-        )
+        block = frames.command_block(reported, mode, kp=kp * share, ki=ki * share, kd=kd * on, torque_max=current * on)
         if not np.isfinite(block["position"]).all():
             raise HandError("a command is not finite; it was not sent")
         return block
@@ -231,45 +230,7 @@ class HandSensing:
         return np.sqrt(sum(taxel[axis].astype(np.float32) ** 2 for axis in "xyz"))
 
 
-def filtered_velocity(velocity: np.ndarray, moved: np.ndarray, seconds: float) -> np.ndarray:
-    """Joint velocities [J] rad/s by a first-order filter, from those before and the motion [J] rad in a time in s."""
-    if seconds <= 0:
-        return velocity
-    weight = seconds / (seconds + _VELOCITY_TIME)
-    return (velocity + weight * (moved / seconds - velocity)).astype(np.float32)
-
-
-# --- taxels at rest and in a run --------------------------------------------------------------------
-
-
-def judge_rest(hand: Hand, counts: np.ndarray, most: float) -> np.ndarray:
-    """Mask [F, N] of stuck taxels, given mean raw counts [F, N] of fingertips that should touch nothing.
-
-    `most` is the sum of a fingertip's counts above which it is touched; stuck taxels do not add to it. Raises
-    HandError: something touches a fingertip, or many of its taxels are stuck.
-    """
-    high = counts > _HIGH
-    beside = around(hand, high)
-    total = np.where(high, 0.0, counts).sum(1)
-    for finger, name in enumerate(hand.finger_names):
-        patch = high[finger] & (beside[finger] > 0)
-        if np.any(high[finger] & (beside[finger] >= _ADJACENT)):
-            what = f"{patch.sum()} adjacent taxels of the {name} read above {_HIGH:.0f} counts"
-            raise HandError(f"cannot tare the taxels: {what}: something touches it; free the fingertips")
-        if total[finger] > most:
-            what = f"those of the {name} read {total[finger]:.0f} counts together, limit {most:.0f}"
-            todo = "free the fingertips; if they read as much untouched, raise --hardware.tare-sum"
-            raise HandError(f"cannot tare the taxels: {what}: something touches it; {todo}")
-    check_masked(hand, high)
-    return high
-
-
-def check_masked(hand: Hand, stuck: np.ndarray) -> None:
-    """Raises HandError: a fingertip has so many stuck taxels [F, N] that no limit would follow its force."""
-    for name, which in zip(hand.finger_names, stuck, strict=True):
-        if which.sum() > _MANY:
-            text = f"{which.sum()} taxels are stuck: {taxel_names(hand, which)}"
-            raise HandError(f"{name}: {text}; power-cycle the hand")
+# --- taxels in a run --------------------------------------------------------------------------------
 
 
 def taxel_names(hand: Hand, which: np.ndarray) -> str:
@@ -285,33 +246,16 @@ def around(hand: Hand, values: np.ndarray) -> np.ndarray:
     return ndimage.convolve(lattice, _NEIGHBOURS, mode="constant").reshape(values.shape)
 
 
-class StuckTaxels:
-    """Finds taxels that get stuck in a run: above what a finger may press, the same for 20 answers, and nothing else on
-    the fingertip reads anything.
-
-    Beside a load a taxel may also saturate. A real load of that size makes `Safety` ease it, which changes the reading;
-    what is stuck stays until the fingertip is free.
-    """
-
-    def __init__(self, hand: Hand):
-        self._first = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)  # counts
-        self._answers = np.zeros(self._first.shape, int)
-
-    def find(self, counts: np.ndarray, limit: np.ndarray) -> np.ndarray:
-        """Mask [F, N] of stuck taxels, given each answer's tared counts [F, N] and what a finger may read [F, 1]."""
-        same = (counts > limit) & (np.abs(counts - self._first) <= _SAME)
-        self._first = np.where(same, self._first, counts)
-        others = np.where(same, 0.0, counts).max(1, keepdims=True)
-        self._answers = np.where(same & (others <= _QUIET), self._answers + 1, 0)
-        return self._answers >= _ANSWERS
-
-
-class ZeroTracker:
-    """Follows the zeros of a run's taxels, which wander over minutes, as the fingertips warm up.
+class TaxelTracker:
+    """Follows the zeros of a run's taxels, which wander over minutes, as the fingertips warm up, and finds stuck ones.
 
     What a free taxel reads on average is its new zero. Light touches look the same to a single taxel, so the zeros of a
     fingertip rise together no faster than they wander with temperature, and to `most` counts: the largest load that
     they can hide.
+
+    A taxel is stuck that reads more than a finger may press, the same for 20 answers, while nothing else on the
+    fingertip reads anything. Beside a load it may also saturate. A real load of that size makes `Safety` ease it, which
+    changes the reading; what is stuck stays until the fingertip is free.
     """
 
     def __init__(self, hand: Hand, most: float):
@@ -320,9 +264,17 @@ class ZeroTracker:
         self._budget = np.full(hand.num_fingers, _FIRST)  # counts by which the zeros of a fingertip may rise now
         self._sum = np.zeros((hand.num_fingers, hand.num_taxels), np.float32)
         self._answers, self._begin = np.zeros(self._sum.shape, int), np.zeros(self._sum.shape)
+        self._first, self._same = np.zeros_like(self._sum), np.zeros_like(self._answers)  # tared counts; answers
 
-    def update(self, time: float, counts: np.ndarray, zero: np.ndarray) -> np.ndarray:
-        """Update with raw counts [F, N] at a time in s; the zeros [F, N], infinite for stuck taxels, which stay so."""
+    def update(self, time: float, counts: np.ndarray, zero: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """Update with raw counts [F, N] at a time in s; the zeros [F, N], infinite for stuck taxels, which stay so.
+        `limit` [F, 1] is how many tared counts a finger may press."""
+        tared = np.maximum(counts - zero, 0.0)
+        same = (tared > limit) & (np.abs(tared - self._first) <= _SAME)
+        self._first = np.where(same, self._first, tared)
+        others = np.where(same, 0.0, tared).max(1, keepdims=True)
+        self._same = np.where(same & (others <= _QUIET), self._same + 1, 0)
+        zero = np.where(self._same >= _ANSWERS, np.float32(np.inf), zero)
         if self._time is None:
             self._begin[:], self._time = time, time
         self._budget = np.minimum(self._budget + _RATE * (time - self._time), _AT_ONCE)

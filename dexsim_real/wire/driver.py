@@ -6,8 +6,7 @@ statistics, and the blocks of `dexsim_real.wire.frames`, so that loop, safety, l
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -84,13 +83,10 @@ class HandDriver(Protocol):
 
 
 class DriverPort(HandPort):
-    """`HandPort` of a hand that has a driver; `options` are those of `HandPort`.
+    """`HandPort` of a hand that has a driver; `hand` gives the number of joints, fingers and taxels."""
 
-    `hand` gives the number of joints, fingers and taxels.
-    """
-
-    def __init__(self, driver: HandDriver, hand: Hand, config: LinkConfig, **options: Any):
-        super().__init__(config, passive_command(hand.num_joints), **options)
+    def __init__(self, driver: HandDriver, hand: Hand, config: LinkConfig):
+        super().__init__(config, passive_command(hand.num_joints))
         self.driver, self._hand = driver, hand
         self._block = driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)
 
@@ -115,7 +111,7 @@ class DriverPort(HandPort):
     def _exchange(self, command: np.ndarray) -> Reply | None:
         self.counts.sent += 1
         sent, on = self._clock(), bool(np.all(command["mode"] == Mode.POSITION))
-        self._tap("tx", Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes()).encode())
+        self.tap("tx", Frame(HOST, palm_address(0), Command.EXCHANGE, command.tobytes()).encode())
         kp, ki, kd = (command[name].astype(float) for name in ("kp", "ki", "kd"))
         targets = JointTargets(command["position"].astype(float), on, kp, ki, kd, command["torque_max"] * 1e-3)
         try:
@@ -129,7 +125,7 @@ class DriverPort(HandPort):
             self.counts.silent += 1
             return None
         block = self._pack(state)
-        self._tap("rx", Frame(palm_address(0), HOST, Command.EXCHANGE, block.tobytes()).encode())
+        self.tap("rx", Frame(palm_address(0), HOST, Command.EXCHANGE, block.tobytes()).encode())
         if not on and np.any(state.on):
             self.counts.refused += 1
             self.refusal = Refusal("motors are on that were told to go off", serious=False)
@@ -181,15 +177,15 @@ def check_wire(hand: Hand) -> None:
         raise HandError(f"{hand.name}: {has}, unlike the XHand: give a driver, --port sdk:MODULE (docs/bridge.md)")
 
 
-def open_port(spec: str, hand: Hand, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
+def open_port(spec: str, hand: Hand, config: LinkConfig) -> HandPort:
     """The hand at a port: an XHand's serial port, or `sdk:MODULE:FUNCTION` for a function that takes the `Hand` and a
-    `LinkConfig` and returns a `HandDriver`. `tap` is that of `SerialHand`.
+    `LinkConfig` and returns a `HandDriver`.
 
     Raises HandError: the module or function cannot be found, or the serial port is for another hand.
     """
     if not spec.startswith("sdk:"):
         check_wire(hand)
-        return SerialHand(spec, config, tap=tap)
+        return SerialHand(spec, config)
     form = "sdk:MODULE:FUNCTION of an importable module"
     driver = find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(hand, config)
-    return DriverPort(driver, hand, config, tap=tap)
+    return DriverPort(driver, hand, config)

@@ -153,22 +153,12 @@ def _read_frame(data: bytes) -> Frame | None:
     return Frame(source, target, command, data[HEADER.size : -2]) if sound else None
 
 
-def command_block(
-    position: np.ndarray,
-    *,
-    kp: np.ndarray | int,
-    ki: np.ndarray | int,
-    kd: np.ndarray | int,
-    torque_max: np.ndarray | int,
-    mode: np.ndarray | int = Mode.POSITION,
-) -> np.ndarray:
-    """Joint commands [J], a `COMMAND_BLOCK` on the wire: angles [J] rad, gains in the firmware's units, current limit
-    in mA; a scalar is for all."""
+def command_block(position: np.ndarray, mode: int = Mode.POSITION, **fields: np.ndarray | int) -> np.ndarray:
+    """Joint commands [J], a `COMMAND_BLOCK` on the wire: angles [J] rad, then gains kp, ki and kd in the firmware's
+    units and torque_max in mA, which are 0 unless given; a scalar is for all."""
     block = np.zeros(len(position), JOINT_COMMAND)
-    block["id"] = np.arange(len(position))
-    block["position"] = position
-    block["kp"], block["ki"], block["kd"] = kp, ki, kd
-    block["torque_max"], block["mode"] = torque_max, mode
+    for name, value in {"id": np.arange(len(position)), "position": position, "mode": mode, **fields}.items():
+        block[name] = value
     return block
 
 
@@ -181,7 +171,7 @@ def empty_state() -> np.ndarray:
 
 def passive_command(joints: int = JOINTS) -> np.ndarray:
     """Joint commands [J] with all motors off."""
-    return command_block(np.zeros(joints), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
+    return command_block(np.zeros(joints), Mode.PASSIVE)
 
 
 def decode(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:

@@ -201,26 +201,20 @@ def printable(content: bytes) -> str:
     return text if text.isprintable() and text.isascii() else ""
 
 
-@dataclasses.dataclass(eq=False)
 class HandPort:
     """A hand on a line that is opened again when it fails, after waits that double at each attempt.
 
-    `exchange` is called from one thread only.
+    `exchange` is called from one thread only. `tap` is called there with ("tx" or "rx", bytes) for every frame.
     """
 
-    config: LinkConfig  # its `backoff` counts
-    passive: np.ndarray  # turns the motors off; until its answer no other command is sent on a line that is new
-    _: dataclasses.KW_ONLY
-    tap: Callable[[str, bytes], None] | None = None
-    """Called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`."""
-    clock: Callable[[], float] | None = None  # s, in which replies are stamped; that of the exchange loop
-    identity: Identity = dataclasses.field(default=Identity(), init=False)  # what the hand tells about itself
-    refusal: Refusal | None = dataclasses.field(default=None, init=False)  # why the newest exchange was refused
+    identity = Identity()  # what the hand tells about itself
+    refusal: Refusal | None = None  # why the newest exchange was refused
 
-    def __post_init__(self) -> None:
-        self.counts = LinkCounts()
-        self._tap = self.tap or (lambda direction, data: None)
-        self._clock, self._sleep = self.clock or time.monotonic, time.sleep
+    def __init__(self, config: LinkConfig, passive: np.ndarray):
+        self.config, self.counts = config, LinkCounts()
+        self.passive = passive  # turns the motors off; until its answer no other command is sent on a line that is new
+        self.tap: Callable[[str, bytes], None] = lambda direction, data: None
+        self._clock, self._sleep = time.monotonic, time.sleep
         self._connected, self._returning, self._generation = False, False, 0
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
@@ -310,11 +304,11 @@ class SerialHand(HandPort):
     """`HandPort` over a serial port: a device, by-id link, pseudo-terminal or pyserial URL.
 
     `identity` is what the hand told about itself when it was connected. Another hand on the port is refused: it is told
-    to turn its motors off, and nothing else. `options` are those of `HandPort`.
+    to turn its motors off, and nothing else.
     """
 
-    def __init__(self, port: str, config: LinkConfig | None = None, **options: Any):
-        super().__init__(config or LinkConfig(), passive_command(), **options)
+    def __init__(self, port: str, config: LinkConfig | None = None):
+        super().__init__(config or LinkConfig(), passive_command())
         self.port = port
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
@@ -359,7 +353,7 @@ class SerialHand(HandPort):
         self.refusal = None
         try:
             self._discard()
-            self._tap("tx", request)
+            self.tap("tx", request)
             sent, before = self._clock(), self._received
             self._serial.write(request)
             answer = self._wait(command, sent, len(request), frames.OVERHEAD + reply)
@@ -388,7 +382,7 @@ class SerialHand(HandPort):
             heard = now if data else heard
             final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
             for frame in self._answers(self._parser.feed(data, final)):
-                self._tap("rx", frame.encode())
+                self.tap("rx", frame.encode())
                 size = frames.OVERHEAD + len(frame.data)
                 possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
                 if possible and frame.command in (command, Command.ERROR):

@@ -108,8 +108,7 @@ def make(monkeypatch, leap):
 
     def make(driver, options="--no-guard"):
         monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
-        given = {"port": "sdk:my_sdk", "hand": "leap_like", "options": options}
-        node = Node("dexsim_hand", **given)
+        node = Node("dexsim_hand", port="sdk:my_sdk", hand="leap_like", options=options)
         install(monkeypatch, node, lambda node: None)
         now = [0.0]
         hand = ros.HandNode(node)

@@ -60,8 +60,8 @@ class DriverBench:
 
     def __init__(self, hand, driver, **hardware):
         self.hand, self.driver, self.time = hand, driver, 0.0
-        driver._clock = self.clock  # of a mock, whose plant it moves
-        self.port = DriverPort(driver, hand, LinkConfig(), clock=self.clock)
+        self.port = DriverPort(driver, hand, LinkConfig())
+        self.port._clock = driver._clock = self.clock  # the driver's: of a mock, whose plant it moves
         self.safety, sensing = Safety(hand, SafetyConfig()), HandSensing(hand, HardwareConfig(**hardware))
         self.loop = ExchangeLoop(self.port, sensing, self.safety, 83.0, clock=self.clock, sleep=self.sleep)
         self.port.connect()

@@ -162,7 +162,9 @@ def test_the_approach_eases_from_the_pose_to_the_posture_in_its_time(hand):
     objects = ObjectSensors(np.zeros(3), (0.0, 0.0, -9.81), None, None)
     loop = PolicyLoop(controller, safety, objects, command=0.5, approach_seconds=2.0, place_seconds=0.0)
     assert [loop.approach(5.0 + time) for time in (0.0, 0.5, 1.0, 1.5, 2.0)] == [True] * 4 + [False]
-    np.testing.assert_allclose(targets, np.outer([0.0, 0.15625, 0.5, 0.84375], np.ones(12)), rtol=1e-6)  # 3 s^2 - 2 s^3
+    controller.spec.posture = ()  # of a task that begins wherever the hand is
+    assert loop.approach(6.5)
+    np.testing.assert_allclose(targets, np.outer([0, 0.15625, 0.5, 0.84375, 0], np.ones(12)), rtol=1e-6)  # 3s^2 - 2s^3
 
 
 # --- goals of the rotation task ----------------------------------------------------------------------

@@ -151,6 +151,15 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on_and_may_not_h
     assert not loop.driven and loop.port.modes[-1] == Mode.PASSIVE
 
 
+def test_the_velocity_is_filtered(loop):
+    """After n steps of h at a constant rate, 1 - (T / (T + h))^n of it is seen; no time changes nothing."""
+    state = frames.empty_state()
+    for number in (*range(6), 5):
+        state["joint"]["position"] = MIDDLE + np.float32(0.02 * number)
+        loop.safety.update(loop._sample(Reply(state, 0.0, 100 + 0.01 * number, number, 1)))
+    np.testing.assert_allclose(loop.safety.sample.velocity, 2.0 * (1 - (2 / 3) ** 5), rtol=1e-4)
+
+
 def test_the_velocity_knows_no_wrong_reading_and_begins_anew_with_a_connection(loop):
     """A reading of 1e30 leaves no trace; a hand that was moved while it was away is not a fast one."""
     run(loop, 5)

@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import os
 import time
+import tty
 from types import SimpleNamespace
 
 import numpy as np
@@ -60,7 +62,7 @@ def test_velocity_is_filtered_as_in_the_simulation():
         sensor.update(0.03 * k, picture(REFERENCE + [0.004 * k, 0, 0], config))
         sensor.update(0.03 * k + 0.01, np.zeros((480, 640), bool))  # Out of sight for a moment.
         sensor.update(0.03 * k - 0.02, picture(REFERENCE, config))  # Late, and says nothing new.
-    when, position, velocity = sensor.read()
+    when, position, velocity = sensor.newest
     assert when == pytest.approx(0.21)
     np.testing.assert_allclose(position, REFERENCE + [0.028, 0, 0], atol=6e-4)
     assert velocity[0] == pytest.approx(0.004 / 0.03 * (1 - 0.5**7), rel=0.15) and not velocity[1:].any()
@@ -81,7 +83,7 @@ def test_a_camera_that_ends_or_fails_says_so():
 def test_a_picture_of_another_clock_does_not_stay_young(when):
     pictures = iter([(when, picture(REFERENCE, CameraConfig())), None])
     sensor = tracking(lambda: next(pictures))
-    assert until(lambda: sensor.newest) and sensor.read()[0] <= time.monotonic()
+    assert until(lambda: sensor.newest[0] > 0) and sensor.newest[0] <= time.monotonic()
     sensor.close()
 
 
@@ -194,9 +196,6 @@ def test_before_it_is_aligned_an_imu_may_begin_with_a_wrong_orientation():
 
 def test_the_imu_thread_reads_a_port():
     pytest.importorskip("serial")
-    import os
-    import tty
-
     master, slave = os.openpty()
     tty.setraw(slave)
     part = imu.Imu(os.ttyname(slave))
@@ -214,7 +213,7 @@ def test_the_imu_thread_reads_a_port():
 
 
 def test_a_policy_waits_for_the_first_picture_and_not_for_a_camera_that_has_ended():
-    camera = SimpleNamespace(newest=None, failure="")
+    camera = SimpleNamespace(newest=(-math.inf,), failure="")
     objects = ObjectSensors(np.zeros(3), DOWN, camera)
     assert not objects.ready()
     camera.failure = "the camera sends no more pictures"

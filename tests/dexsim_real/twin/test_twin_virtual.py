@@ -67,7 +67,7 @@ def test_the_camera_measures_the_height(hand):
         camera = virtual_camera(port, spec)
         free(plant, reference + (0.01, 0.0, 0.0))
         port.sleep(0.002)
-        _, position, _ = camera.read()
+        _, position, _ = camera.newest
         assert position[1:] == pytest.approx(reference[1:])
         if shape == "sphere":  # Its outline by a pinhole: a cone of half angle asin(r / d), nearly a circle.
             radius = 600 * math.tan(math.asin(plant.shape.parts[0].size[0] / math.dist(OPTICS.position, position)))

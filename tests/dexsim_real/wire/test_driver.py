@@ -27,8 +27,8 @@ def off(hand):
     return HandSensing(hand, HardwareConfig()).command(np.zeros(hand.num_joints), Mode.PASSIVE)
 
 
-def opened(hand, driver, **options):
-    port = DriverPort(driver, hand, LinkConfig(backoff=(0.001, 0.002)), **options)
+def opened(hand, driver):
+    port = DriverPort(driver, hand, LinkConfig(backoff=(0.001, 0.002)))
     port.connect()
     return port
 
@@ -82,7 +82,8 @@ def test_a_state_that_does_not_keep_the_promise_is_refused(leap, values, says):
 
 def test_a_line_that_fails_is_connected_again_with_the_motors_off(leap):
     driver, now = ScriptedDriver(leap), [0.0]
-    port = opened(leap, driver, clock=lambda: now[0])
+    port = opened(leap, driver)
+    port._clock = lambda: now[0]
     on = HandSensing(leap, HardwareConfig()).command(np.zeros(16), Mode.POSITION)
     assert port.exchange(on).generation == 1
     driver.failing = True

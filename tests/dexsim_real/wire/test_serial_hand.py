@@ -42,7 +42,8 @@ def test_one_request_one_answer():
         state["joint"]["position"] = block["position"] + 0.25
 
     with PtyHand(answer) as peer:
-        port = SerialHand(peer.port, QUICK, tap=lambda way, data: seen.append((way, bytes(data))))
+        port = SerialHand(peer.port, QUICK)
+        port.tap = lambda way, data: seen.append((way, bytes(data)))
         assert "firmware 1.3.9" in port.connect()
         reply = port.exchange(motors(0.5))
         np.testing.assert_array_equal(reply.state["joint"]["position"], np.full(12, 0.75, np.float32))
