@@ -132,13 +132,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
-        first, hand = trajectories[0], env.hand
-        names = {"joint_position": hand.joint_names, "target": hand.joint_names}
-        series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
-        for name in (*(name for name in READINGS if name != "taxel_force"), "target"):
-            values = getattr(first, name).reshape(len(first.time), -1)
-            series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
-        show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)
+        first = trajectories[0]
+        series = {name: getattr(first, name) for name in (*READINGS, "target") if name != "taxel_force"}
+        series["force"] = first.taxel_force.sum(-1)
+        show_rerun(env.hand, first.time, series, first.taxel_force, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
     if arguments.npz:
         kinds, period = env.primitive_kinds, env.control_period
