@@ -34,7 +34,7 @@ from dexsim.tasks.rotate.start import (
     sample_turned_object,
     solid_inertia,
 )
-from dexsim.tasks.shared import action_rate, joint_speed, palm_height, random_push
+from dexsim.tasks.shared import palm_height, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
 _EPSILON, _STEEPNESS = 0.1, 400.0  # rad and 1/m, of the paper's reward
@@ -86,19 +86,6 @@ def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) ->
     """1 / (|d_rot| + 0.1) / (1 + exp(400 (d_goal - gate)))."""
     gate = jax.nn.sigmoid(_STEEPNESS * (weights.gate - distance))
     return gate / (jnp.abs(angle) + _EPSILON)
-
-
-def tips_at_work(duty: jax.Array) -> jax.Array:
-    """min(duty / `WORKING_DUTY`, 1) [] of the least busy of the `WORKING_TIPS` busiest fingertips; `duty` [F].
-
-    With their mean, two busy fingertips would earn most of the bonus, and some seeds use only two.
-    """
-    return jnp.minimum(jnp.sort(duty)[::-1][:WORKING_TIPS] / WORKING_DUTY, 1.0)[-1]
-
-
-def trap_cost(tilt: jax.Array, ahead: jax.Array) -> jax.Array:
-    """2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it."""
-    return (tilt / 0.6) ** 2 + (jnp.maximum(ahead, 0.0) / 0.022) ** 2
 
 
 class Rotate(Task):
@@ -218,7 +205,10 @@ class Rotate(Task):
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, after = self.config.reward, self.progress(goal, truth), self.update(None, goal, truth)
         fallen = dropped.astype(jnp.float32)
-        held, work = 1.0 - fallen, tips_at_work(after.duty)
+        held = 1.0 - fallen
+        # Of the least busy of the busiest fingertips: with their mean, two would earn most of the bonus, and some seeds
+        # use only two.
+        work = jnp.minimum(jnp.sort(after.duty)[::-1][:WORKING_TIPS] / WORKING_DUTY, 1.0)[-1]
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= _FROM_GOAL).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))
@@ -226,13 +216,15 @@ class Rotate(Task):
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
             "bonus": held * weights.bonus * now.success.astype(jnp.float32) * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
-            "action": weights.action * action_rate(truth.action, truth.last_action),
-            "velocity": weights.velocity * joint_speed(truth.joint_velocity),
+            "action": weights.action * jnp.sum((truth.action - truth.last_action) ** 2),
+            "velocity": weights.velocity * jnp.sum(truth.joint_velocity**2),
             "torque": weights.torque * jnp.sum(truth.joint_torque**2),
             "drop": weights.drop * fallen,
         }
         if self.config.trap > 0:
-            terms["trap"] = -trap_cost(self._tilt(truth), truth.object_position[2] - self.reference[2])
+            # 2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it.
+            ahead = jnp.maximum(truth.object_position[2] - self.reference[2], 0.0)
+            terms["trap"] = -((self._tilt(truth) / 0.6) ** 2 + (ahead / 0.022) ** 2)
         ticks = jnp.maximum(after.clock / self._period, 1.0)
         mean = {name: total / ticks for name, total in after.totals.items()}
         turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
