@@ -26,7 +26,7 @@ from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import require
 from dexsim.datasets.episodes import Episodes, write_episodes
-from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, from_readings, write_lerobot
+from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, write_lerobot
 from dexsim.datasets.rerun import show_rerun
 from dexsim.env.evaluation import evaluation_of
 from dexsim.hand.mjcf import hand_poses
@@ -63,8 +63,8 @@ def record(
     trajectories, snapshots = [], []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
-        rows = [{name: values[t, i] for name, values in readings.items()} for t in range(length)]
-        trajectories.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
+        rows = {name: values[:length, i] for name, values in readings.items()}
+        trajectories.append(Trajectory(time=np.arange(length) * env.control_period, target=target[:length, i], **rows))
         snapshots.append(shown.map(operator.itemgetter((slice(length), i))))
     return trajectories, snapshots
 

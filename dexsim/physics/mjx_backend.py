@@ -68,7 +68,7 @@ class MjxBackend:
         force = jnp.sum(frame * local[..., None], 1)
         touching = (touch.dist[use] < touch.includemargin[use])[:, None]
         force = jnp.where(touching, force, 0.0)
-        # MuJoCo's contact force acts on geom2; geom1 feels the opposite. The object is no finger's, nor twice in a pair.
+        # The force acts on geom2; geom1 feels the opposite. The object is no finger's, and not twice in a pair.
         finger = jnp.max(jnp.asarray(self._finger_of_geom)[touch.geom[use]], -1)
         first, second = jnp.asarray(self._is_object_geom, jnp.float32)[touch.geom[use]].T
         share = (first - second)[None] * jax.nn.one_hot(finger, fingers).T

@@ -19,6 +19,10 @@ INK, FAINT, PANEL, EMPTY, ACCENT = ((233, 236, 241), (138, 146, 160), (24, 27, 3
 _INFERNO = """
 1e0c45 380962 510e6c 69166e 801f6c 982766 b0315b c63d4d d94d3d e9612b f47918 fa9407 fcb014 f8cd37 f2ea69 fcffa4
 """
+_KNOWN = np.array([tuple(bytes.fromhex(color)) for color in _INFERNO.split()])
+_PLACE = np.linspace(0, len(_KNOWN) - 1, 256)
+_COLORS = np.stack([np.interp(_PLACE, np.arange(len(_KNOWN)), channel) for channel in _KNOWN.T], -1)
+_COLORS = _COLORS.round().astype(np.uint8)  # sRGB [256, 3]
 _GAP = 1  # pixels between two cells
 TRUE, FELT = ("maps: taxel force", "bars: contact force"), ("maps: taxel force", "bars: their sum")
 """Captions of a panel whose bars show the simulation's contact forces, or what the taxels feel."""
@@ -32,17 +36,8 @@ def taxel_image(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
 
 def force_color(force: np.ndarray, force_range: float) -> np.ndarray:
     """sRGB bytes [..., 3] of forces [...] on the perceptual colour scale from 0 to `force_range`, both in N."""
-    table = _color_table()
     level = np.nan_to_num(np.asarray(force, np.float64) / force_range)
-    return table[np.clip(level * (len(table) - 1), 0, len(table) - 1).astype(int)]
-
-
-@lru_cache(maxsize=1)
-def _color_table() -> np.ndarray:
-    known = np.array([tuple(bytes.fromhex(color)) for color in _INFERNO.split()])
-    place = np.linspace(0, len(known) - 1, 256)
-    table = [np.interp(place, np.arange(len(known)), channel) for channel in known.T]
-    return np.stack(table, -1).round().astype(np.uint8)
+    return _COLORS[np.clip(level * (len(_COLORS) - 1), 0, len(_COLORS) - 1).astype(int)]
 
 
 @lru_cache(maxsize=8)
