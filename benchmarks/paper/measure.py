@@ -204,9 +204,6 @@ def trials(
     return zero_shot.metrics(task, policy, reports) | {"trials": len(reports)}
 
 
-# --- objects that no training has seen -------------------------------------------------------------------
-
-
 def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """A shipped policy with held-out objects, each at every command."""
     del seed, work

@@ -51,9 +51,6 @@ def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     return f"{count} × {short}{each}, {report['budget']} budget"
 
 
-# --- rotation -------------------------------------------------------------------------------------------
-
-
 def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """The paper's columns beside ours in simulation and on the emulated hand."""
     paper = any(row.paper for row in experiment.rows)
@@ -107,9 +104,6 @@ def touch_map(experiment: Experiment, reports: Reports) -> list[list[str]]:
         cells += [cell(mean_turns(seed, way) for seed in pair[0]) for way in ("ablated", "another")]
         lines.append([row.label, *cells, how(experiment, row, reports.get(row.name))])
     return lines
-
-
-# --- grasp ----------------------------------------------------------------------------------------------
 
 
 def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
@@ -174,9 +168,6 @@ def held_out(experiment: Experiment, reports: Reports) -> list[list[str]]:
 
 def _object(name: str, row: dict[str, Any]) -> list[str]:
     return [name, percent([row["held"]]), *(cell([row[key]]) for key in ("r_resultant", "r_taxels", "force_error_n"))]
-
-
-# --- sweeps ---------------------------------------------------------------------------------------------
 
 
 def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:

@@ -255,8 +255,6 @@ class Grasp(Task):
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
         }
 
-    # --- evaluation ------------------------------------------------------------------------
-
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, GraspGoal]:
         """Pool rows [count] and goals: five commands for each shape, evenly, never changing."""
         rows = np.arange(count)

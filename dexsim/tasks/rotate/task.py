@@ -72,9 +72,6 @@ class Progress:
     success: jax.Array  # [] bool
 
 
-# --- small pure functions ----------------------------------------------------------------------
-
-
 def goal_quat(turns: jax.Array | int, axis: jax.Array, angle: jax.Array | float) -> jax.Array:
     """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
     # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
@@ -251,8 +248,6 @@ class Rotate(Task):
         own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), self._axis)
         across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
         return jnp.arctan2(across, jnp.sum(own * self._axis))
-
-    # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
         """Rows [count], evenly spread over those of the pool outside the trap; goals that end with a drop only."""
