@@ -216,7 +216,7 @@ class Motions:
                 reach = jnp.clip(begin.target - position, -REACH, REACH)
                 return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
 
-            return physics.advance(motors, begin.object, begin.state, begin.push)
+            return physics.advance(motors, physics.fields(begin.object), begin.state, begin.push)
 
         def all_ticks(begin: Begin):
             def body(state: PhysicsState, _: None):
