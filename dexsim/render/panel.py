@@ -4,9 +4,6 @@ Drawn with Pillow and NumPy: matplotlib would cost more than the rest of a frame
 seen from outside: column 0 at the left, row 0 (base of the fingertip) at the bottom; taxel index = column * rows + row.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -48,22 +45,16 @@ def _font(size: int):
 
 
 def draw_panel(
-    hand: Hand,
-    size: tuple[int, int],
-    snapshot: Snapshot,
-    force_range: float,
-    finger_range: float,
-    lines: Mapping[str, str],
-    captions: tuple[str, str] = TRUE,
+    hand: Hand, size: tuple[int, int], snapshot: Snapshot, force_range: float, finger_range: float, live: bool = False
 ) -> np.ndarray:
     """A panel of `size` (width, height) pixels, uint8 [height, width, 3]: two columns of blocks, the fingers in order
-    and the read-outs last.
+    and last the read-outs, which a `live` view has elsewhere.
 
-    `lines` are read-outs (`read_outs`), `captions` say what maps and bars show. The bar under a map is the finger's
-    force out of `finger_range` N; its mark is the target.
+    The bar under a map is the finger's force out of `finger_range` N; its mark is the target.
     """
     from PIL import Image, ImageDraw
 
+    captions, lines = (FELT, {}) if live else (TRUE, read_outs(snapshot))
     (columns, rows), count = hand.taxel_grid, (hand.num_fingers + 2) // 2
     font_size = max(8, round(size[1] / 36))
     # A block is a title line, the map and a force bar, with air below.
