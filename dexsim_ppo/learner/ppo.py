@@ -180,9 +180,6 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
     return jnp.clip(scale + step, 0.0, 1.0), success
 
 
-# --- advantages ---------------------------------------------------------------------------------------
-
-
 def prepare(
     config: PPOConfig, state: TrainState, rollout: Rollout, mesh: Mesh | None = None
 ) -> tuple[Samples, TrainState, jax.Array]:
