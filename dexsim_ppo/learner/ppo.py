@@ -25,8 +25,8 @@ from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_mlp, 
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
 from dexsim_ppo.learner.running_stats import init_stats, merge_moments, value_std
 from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
-from dexsim_ppo.learner.types import Environment, TrainState
-from dexsim_ppo.learner.update import Learner, init_adam, update
+from dexsim_ppo.learner.types import AdamState, Environment, TrainState
+from dexsim_ppo.learner.update import Learner, update
 
 
 class Training(NamedTuple):
@@ -104,13 +104,14 @@ def init_state(
         critic=init_mlp(critic_key, critic, output_gain=1.0),
         memory=memory,
     )
+    zeros = jax.tree.map(jnp.zeros_like, params)
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
     scale = jnp.float32(curriculum.start) if curriculum.on else None
     reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
         average=(params.actor, params.memory),
-        adam=init_adam(params),
+        adam=AdamState(jnp.int32(0), zeros, zeros),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()),
