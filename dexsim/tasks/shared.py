@@ -1,4 +1,4 @@
-"""What tasks share: where an object can be put, and pushes on it."""
+"""What tasks share: where an object can be put, reward terms on the motion of the hand, pushes on the object."""
 
 from typing import Any
 
@@ -53,6 +53,16 @@ def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Arr
     if not gaps:
         raise AssetError(f"{hand.model_path}: no capsule, sphere or box has contype or conaffinity above 0")
     return jnp.min(jnp.stack(gaps))
+
+
+def action_rate(action: jax.Array, last_action: jax.Array) -> jax.Array:
+    """R_action: squared change of the action."""
+    return jnp.sum((action - last_action) ** 2)
+
+
+def joint_speed(velocity: jax.Array) -> jax.Array:
+    """R_vel: squared joint velocity."""
+    return jnp.sum(velocity**2)
 
 
 def random_push(key: jax.Array, mass: jax.Array, config: Any) -> jax.Array:

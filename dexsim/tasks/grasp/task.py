@@ -28,7 +28,7 @@ from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
-from dexsim.tasks.shared import clearance, close_fingers, palm_height, random_push
+from dexsim.tasks.shared import action_rate, clearance, close_fingers, joint_speed, palm_height, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
@@ -231,8 +231,8 @@ class Grasp(Task):
             "overload": held * weights.overload * jnp.sum(too_much) / config.max_force,
             "spread": weights.spread * joint_spread(truth.joint_position[self.hand.root_joint[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
-            "action": weights.action * jnp.sum((truth.action - truth.last_action) ** 2),
-            "velocity": weights.velocity * jnp.sum(truth.joint_velocity**2),
+            "action": weights.action * action_rate(truth.action, truth.last_action),
+            "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "drop": weights.drop * fallen,
         }
         parts = {"force": force, "normal": truth.normal_force, "taxels": jnp.sum(truth.touch.force, -1)}

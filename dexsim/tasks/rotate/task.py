@@ -34,7 +34,7 @@ from dexsim.tasks.rotate.start import (
     sample_turned_object,
     solid_inertia,
 )
-from dexsim.tasks.shared import palm_height, random_push
+from dexsim.tasks.shared import action_rate, joint_speed, palm_height, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
 _EPSILON, _STEEPNESS = 0.1, 400.0  # rad and 1/m, of the paper's reward
@@ -213,8 +213,8 @@ class Rotate(Task):
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
             "bonus": held * weights.bonus * now.success.astype(jnp.float32) * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
-            "action": weights.action * jnp.sum((truth.action - truth.last_action) ** 2),
-            "velocity": weights.velocity * jnp.sum(truth.joint_velocity**2),
+            "action": weights.action * action_rate(truth.action, truth.last_action),
+            "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "torque": weights.torque * jnp.sum(truth.joint_torque**2),
             "drop": weights.drop * fallen,
         }
