@@ -150,7 +150,7 @@ class Motions:
         model = self.model(begin)
         data = self._run(dataclasses.replace(begin, push=free), model, CLOSING)
         data = self._run(begin, model, CLOSING // 2, data)
-        touching = np.linalg.norm(self._finger_force(model, data), axis=-1) > 0.3
+        touching = np.linalg.norm(data.sensordata.reshape(-1, 3), axis=-1) > 0.3
         if touching.sum() < 2 or np.linalg.norm(data.qvel[scene.object_dof[:3]]) > 0.03:
             return None
         state = PhysicsState(data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy())
@@ -201,23 +201,9 @@ class Motions:
             model, data, ticks = self.model(begin), None, []
             for _ in range(self.ticks):
                 data = self._run(begin, model, self.env.config.physics.substeps, data)
-                ticks.append((data.qpos.copy(), data.qvel.copy(), self._finger_force(model, data)))
+                ticks.append((data.qpos.copy(), data.qvel.copy(), -data.sensordata.reshape(-1, 3)))
             traces.append([np.stack(x) for x in zip(*ticks, strict=True)])
         return self._trace(*(np.stack(x, 1) for x in zip(*traces, strict=True)))
-
-    def _finger_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """Force of the object on each finger [F, 3] N: a sum over `mj_contactForce`."""
-        scene, wrench = self.exact.scene, np.zeros(6)
-        total, tips = np.zeros((len(scene.tip_bodies), 3)), scene.tip_bodies.tolist()
-        for index, contact in enumerate(data.contact):
-            first, second = (int(model.geom_bodyid[geom]) for geom in contact.geom)
-            if scene.object_body in (first, second):
-                mujoco.mj_contactForce(model, data, index, wrench)
-                force = contact.frame.reshape(3, 3).T @ wrench[:3]  # of the first on the second
-                for body, sign in ((second, 1.0), (first, -1.0)):
-                    if body in tips:
-                        total[tips.index(body)] += sign * force
-        return total
 
     # --- the engines ----------------------------------------------------------------------------
 
@@ -230,7 +216,7 @@ class Motions:
                 reach = jnp.clip(begin.target - position, -REACH, REACH)
                 return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
 
-            return physics.advance(motors, begin.object, begin.state, begin.push)
+            return physics.advance(motors, physics.fields(begin.object), begin.state, begin.push)
 
         def all_ticks(begin: Begin):
             def body(state: PhysicsState, _: None):

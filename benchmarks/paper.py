@@ -1,7 +1,6 @@
 """The paper's tables and figures, each by one command: train what is missing, measure, draw.
 
     python benchmarks/paper.py exact_rewards --budget cpu  five trainings a row, then its table and figure
-    python benchmarks/paper.py exact_rewards --list        rows, and what is done
     python benchmarks/paper.py all --budget smoke
     python benchmarks/paper.py objects --output docs/results
 

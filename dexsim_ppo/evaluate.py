@@ -194,14 +194,7 @@ def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "qu
 
 
 def evaluate_policy(
-    policy: Policy | str | Path,
-    *,
-    episodes: int = 0,
-    seed: int = 0,
-    env: Environment | None = None,
-    backend: str = "auto",
-    chunk: int = 0,
-    baseline: bool = True,
+    policy: Policy | str | Path, *, episodes: int = 0, seed: int = 0, env: Environment | None = None
 ) -> dict[str, Any]:
     """Measure a policy over fixed, seeded episodes.
 
@@ -210,23 +203,20 @@ def evaluate_policy(
       episodes: how many, rounded up to whole chunks; 0 chooses by the device and the length of an episode.
       seed: of the episodes.
       env: where to measure it; None for the environment that it was trained in. Another one is warned of.
-      backend: physics, where `env` is None.
-      chunk: episodes run side by side; 0 chooses by the device.
-      baseline: measure a hand that does nothing on the same episodes, too, which doubles the time.
 
     Returns:
       The report: `"held"`, `"return"`, `"steps_held"` with 95 % intervals, `"task"`: the task's own figures, and
-      `"do_nothing"`: the same of the baseline.
+      `"do_nothing"`: the same of a hand that does nothing.
 
     Raises:
       CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     if env is None:
-        env = policy.make_env(backend=backend)
+        env = policy.make_env()
     else:
         policy.check_env(env)
-    return _measure(policy, env, episodes, seed, chunk, baseline)[0]
+    return _measure(policy, env, episodes, seed, chunk=0, baseline=True)[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

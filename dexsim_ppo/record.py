@@ -26,7 +26,7 @@ from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import require
 from dexsim.datasets.episodes import Episodes, write_episodes
-from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, from_readings, write_lerobot
+from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, write_lerobot
 from dexsim.datasets.rerun import show_rerun
 from dexsim.env.evaluation import evaluation_of
 from dexsim.hand.mjcf import hand_poses
@@ -63,8 +63,8 @@ def record(
     trajectories, snapshots = [], []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
-        rows = [{name: values[t, i] for name, values in readings.items()} for t in range(length)]
-        trajectories.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
+        rows = {name: values[:length, i] for name, values in readings.items()}
+        trajectories.append(Trajectory(time=np.arange(length) * env.control_period, target=target[:length, i], **rows))
         snapshots.append(shown.map(operator.itemgetter((slice(length), i))))
     return trajectories, snapshots
 
@@ -132,13 +132,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
-        first, hand = trajectories[0], env.hand
-        names = {"joint_position": hand.joint_names, "target": hand.joint_names}
-        series = {"force": (hand.finger_names, first.taxel_force.sum(-1))}
-        for name in (*(name for name in READINGS if name != "taxel_force"), "target"):
-            values = getattr(first, name).reshape(len(first.time), -1)
-            series[name] = names.get(name, tuple(f"{name} {i}" for i in range(values.shape[1]))), values
-        show_rerun(hand, first.time, series, first.taxel_force, arguments.rrd)
+        first = trajectories[0]
+        series = {name: getattr(first, name) for name in (*READINGS, "target") if name != "taxel_force"}
+        series["force"] = first.taxel_force.sum(-1)
+        show_rerun(env.hand, first.time, series, first.taxel_force, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
     if arguments.npz:
         kinds, period = env.primitive_kinds, env.control_period

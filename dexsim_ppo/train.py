@@ -106,8 +106,8 @@ def train_policy(
     given = {"env": config, "ppo": ppo, "policy": str(policy) or None} | options
     default = _with_budget(default, {name for name, value in options.items() if value is not None})
     arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
-    run = make_run(arguments, source, started, "train_policy(...)")
-    if train_run(run, source, "train_policy(...)"):
+    run, stopped = train(arguments, source, started, "train_policy(...)")
+    if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
     return TrainResult(load_policy(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
 
@@ -128,8 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     with processes.exit_on_error():
         arguments, source = parse_arguments(argv)
-        run = make_run(arguments, source, started, command)
-        stopped = train_run(run, source, command)
+        run, stopped = train(arguments, source, started, command)
     if not stopped:
         return 0
     processes.print_on_first(
@@ -139,8 +138,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 128 + stopped
 
 
-def make_run(arguments: TrainArguments, source: Source, started: float, command: str) -> Run:
-    """A run with its folder, ready to train."""
+def train(arguments: TrainArguments, source: Source, started: float, command: str) -> tuple[Run, int]:
+    """Train, evaluate and report: the run, and the number of the signal that stopped it or 0."""
     new = processes.is_first() and not isinstance(source, checkpoint.Checkpoint)
     # Errors come before the environment is made, which takes seconds.
     if isinstance(source, checkpoint.Checkpoint):
@@ -174,17 +173,13 @@ def make_run(arguments: TrainArguments, source: Source, started: float, command:
         folder.checkpoints.mkdir(parents=True)
         record = {"command": command, "arguments": printable(arguments), "hand": record_of(hand)}
         cli.write_json(folder.config, record | cli.environment_report())
-    return Run(env, arguments, folder, started, mesh)
-
-
-def train_run(run: Run, source: Source, command: str) -> int:
-    """Train, then evaluate and report; the number of the signal that stopped it or 0."""
+    run = Run(env, arguments, folder, started, mesh)
     with stop_on_signals() as received:
         run.train(source, lambda: processes.agree(received()))
         stopped = processes.agree(received())
     if processes.is_first() and not stopped:
         run.finish(command)
-    return stopped
+    return run, stopped
 
 
 @contextlib.contextmanager

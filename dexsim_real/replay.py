@@ -209,13 +209,10 @@ def plot(run: Replay, path: Path) -> None:
 
 def write_rerun(run: Replay, path: Path) -> None:
     """Write a recording for the rerun viewer: the signals, the observation by fields, and taxels as pictures."""
-    hand = run.hand
-    names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
-    series = {name: (names.get(name, (name,)), values) for name, values in signals(run).items()}
-    edges = np.cumsum([field.size for field in run.fields])[:-1]
+    series, edges = signals(run), np.cumsum([field.size for field in run.fields])[:-1]
     for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True):
-        series[f"observation/{field.name}"] = tuple(f"{field.name} {i}" for i in range(field.size)), values
-    show_rerun(hand, run.time, series, np.stack([now.taxel_force for now in run.measured]), path)
+        series[f"observation/{field.name}"] = values
+    show_rerun(run.hand, run.time, series, np.stack([now.taxel_force for now in run.measured]), path)
 
 
 if __name__ == "__main__":

@@ -4,22 +4,13 @@ import argparse
 import datetime
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
-from paper.data import (
-    BUDGETS,
-    Budget,
-    Experiment,
-    commit,
-    load_report,
-    missing_seeds,
-    report_path,
-    settings_of,
-)
+from paper.data import BUDGETS, Budget, Experiment, commit, load_report, missing_seeds, report_path, settings_of
 from paper.experiments import EXPERIMENTS
 
 WORK = Path("runs") / "paper"
@@ -30,29 +21,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python benchmarks/paper.py", description="The paper's tables and figures.")
     parser.add_argument("name", choices=(*EXPERIMENTS, "all"), help="a table")
     parser.add_argument("--budget", choices=tuple(BUDGETS), default="cpu", help="smoke, two cores, or one GPU")
-    parser.add_argument("--list", action="store_true", help="rows, and which seeds are done")
     parser.add_argument("--row", nargs="+", default=[], help="these rows alone, so that several GPUs share a table")
     parser.add_argument("--output", type=Path, default=WORK / "reports", help="folder of reports and tables")
     given = parser.parse_args(argv)
     budget, chosen = BUDGETS[given.budget], EXPERIMENTS.values() if given.name == "all" else [EXPERIMENTS[given.name]]
-    if unknown := set(given.row) - {row.name for experiment in chosen for row in experiment.rows}:
-        raise ConfigError(f"--row {sorted(unknown)[0]}: not a row of {given.name}; --list names them")
+    rows = [row.name for experiment in chosen for row in experiment.rows]
+    if unknown := set(given.row) - set(rows):
+        raise ConfigError(f"--row {sorted(unknown)[0]}: choose from {', '.join(rows)}")
     for experiment in chosen:
-        if given.list:
-            print("\n".join(listing(experiment, budget, given.output)))
-        else:
-            run(experiment, budget, given.output, WORK / budget.name, given.row)
+        run(experiment, budget, given.output, WORK / budget.name, given.row)
     return 0
-
-
-def listing(experiment: Experiment, budget: Budget, output: Path) -> Iterator[str]:
-    """Lines: the experiment, and each row with what is done."""
-    yield f"{experiment.name}: {experiment.title}"
-    for row in experiment.rows:
-        report, seeds = load_report(report_path(output, experiment, row)), len(experiment.seeds(budget))
-        done = seeds - len(missing_seeds(experiment, row, budget, report))
-        state = f"{done} of {seeds} seeds" + (f", {report['budget']} budget at {report['commit']}" if done else "")
-        yield f"  {row.name:<28} {state:<40} {row.label}"
 
 
 def run(experiment: Experiment, budget: Budget, output: Path, work: Path, only: Sequence[str] = ()) -> None:

@@ -23,10 +23,9 @@ REPORTS = ROOT / "docs" / "results"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Budget:
-    """How much a row may cost. A row keeps the report of the highest level."""
+    """How much a row may cost. A row keeps the report of the largest budget, the last of `BUDGETS`."""
 
     name: str
-    level: int
     preset: str = "cpu"
     backend: str = "c"
     # By skill: options of the training command for one seed. Empty: shipped policies stand in, nothing is trained.
@@ -43,7 +42,6 @@ class Budget:
 BUDGETS = {
     "smoke": Budget(
         name="smoke",
-        level=0,
         training={},
         episodes={"grasp": 10, "rotate": 10},
         trials={"grasp": 1, "rotate": 1},
@@ -53,7 +51,6 @@ BUDGETS = {
     ),
     "cpu": Budget(
         name="cpu",
-        level=1,
         training={"grasp": {"minutes": 20.0}, "rotate": {"minutes": 30.0}},
         episodes={"grasp": 150, "rotate": 16},
         trials={"grasp": 25, "rotate": 10},
@@ -62,7 +59,6 @@ BUDGETS = {
     ),
     "gpu": Budget(
         name="gpu",
-        level=2,
         preset="gpu",
         backend="auto",
         training={"grasp": {"steps": 9e7, "evaluate_every": 0}, "rotate": {"steps": 4e7, "evaluate_every": 0}},
@@ -78,7 +74,6 @@ BUDGETS = {
 BUDGETS["long"] = dataclasses.replace(
     BUDGETS["gpu"],
     name="long",
-    level=3,
     training={"grasp": {"steps": 1.5e8, "evaluate_every": 0}, "rotate": {"steps": 1e8, "evaluate_every": 0}},
     trials={"grasp": 50, "rotate": 6},
 )
@@ -154,10 +149,11 @@ def weights_of(file: Path) -> str:
 
 def missing_seeds(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> list[int]:
     """Seeds that a row's report, which may be empty, lacks for a budget."""
-    expected = list(experiment.seeds(budget))
-    if not report or report["row"] != settings_of(row) or BUDGETS[report["budget"]].level < budget.level:
+    expected, sizes = list(experiment.seeds(budget)), list(BUDGETS)
+    larger = sizes.index(report["budget"]) - sizes.index(budget.name) if report else 0
+    if not report or report["row"] != settings_of(row) or larger < 0:
         return expected
-    if BUDGETS[report["budget"]].level > budget.level:
+    if larger > 0:
         return []
     return [seed for seed in expected if str(seed) not in report["seeds"]]
 

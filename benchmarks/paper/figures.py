@@ -6,18 +6,17 @@ from typing import Any
 import numpy as np
 
 from paper.data import Experiment
-from paper.tables import mean_turns, seeds
+from paper.tables import Reports, mean_turns, seeds
 
-Reports = dict[str, dict[str, Any]]
 COLORS = ("#1f77b4", "#d95f02", "#2a9d5c", "#7b4fa3", "#8c6d31", "#555555", "#c0305e")
 
 
-def _subplots(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """A figure that no window shows, and its axes [rows, columns]."""
+def _subplots(columns: int, width: float, height: float) -> tuple[Any, Any]:
+    """A figure that no window shows, and its axes [columns]."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    figure = Figure(figsize=(width * columns, height), layout="constrained")
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
 def _save(figure: Any, path: Path) -> None:
@@ -30,8 +29,7 @@ def _save(figure: Any, path: Path) -> None:
 
 def successes(experiment: Experiment, reports: Reports, folder: Path) -> None:
     """The successes of all trials on the emulated hand in order, row by row, and the paper's."""
-    figure, axes = _subplots(1, 1, 7.0, 3.6)
-    axis = axes[0, 0]
+    figure, (axis,) = _subplots(1, 7.0, 3.6)
     for color, row in zip(COLORS, experiment.rows, strict=False):
         key = "paper_successes" if row.task == "rotate_paper" else "successes"
         counts = sorted(v for seed in seeds(reports.get(row.name)) for v in seed["hand"][key]["sorted"])
@@ -50,8 +48,8 @@ def successes(experiment: Experiment, reports: Reports, folder: Path) -> None:
 def touch_map(experiment: Experiment, reports: Reports, folder: Path) -> None:
     """Quarter turns of each world with touch and without it, a dot a seed."""
     pairs = list(zip(experiment.rows[::2], experiment.rows[1::2], strict=True))
-    figure, axes = _subplots(1, 3, 3.2, 6.0)
-    for axis, world in zip(axes[0], ("simulation", "hand", "foreign"), strict=True):
+    figure, axes = _subplots(3, 3.2, 6.0)
+    for axis, world in zip(axes, ("simulation", "hand", "foreign"), strict=True):
         for place, pair in enumerate(pairs):
             means = [[mean_turns(s, world)["mean"] for s in seeds(reports.get(row.name))] for row in pair]
             for color, values in zip(COLORS, means, strict=False):
@@ -59,20 +57,20 @@ def touch_map(experiment: Experiment, reports: Reports, folder: Path) -> None:
                 axis.plot([np.mean(values or np.nan)], [place], "|", color=color, ms=12)
         title = {"hand": "emulated hand", "foreign": "foreign plant"}.get(world, world)
         axis.set(title=title, xlabel="quarter turns in 120 s", yticks=[], ylim=(len(pairs), -1), xlim=(0, None))
-    axes[0, 0].set_yticks(range(len(pairs)), [row.label for row, _ in pairs], fontsize=7)
+    axes[0].set_yticks(range(len(pairs)), [row.label for row, _ in pairs], fontsize=7)
     figure.supxlabel("blue: with touch; orange: without; a dot a training seed", fontsize=8)
     _save(figure, folder / "touch_map.svg")
 
 
 def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> None:
     """Force and torque over the command in both worlds: means with bands."""
-    figure, axes = _subplots(1, 3, 3.4, 3.0)
+    figure, axes = _subplots(3, 3.4, 3.0)
     names = {
         "finger_force_n": "finger force [N]",
         "total_force_n": "total force [N]",
         "total_torque": "total torque [share of the limit]",
     }
-    for axis, (name, label) in zip(axes[0], names.items(), strict=True):
+    for axis, (name, label) in zip(axes, names.items(), strict=True):
         for color, row in zip(COLORS, experiment.rows, strict=False):
             for world, style in (("simulation", "-"), ("hand", "--")):
                 command, middle, low, high = _curve(seeds(reports.get(row.name)), world, name)
@@ -81,7 +79,7 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
                     axis.plot(command, middle, style, color=color, lw=1.5, label=text)
                     axis.fill_between(command, low, high, color=color, alpha=0.15, lw=0)
         axis.set(xlabel="force command", ylabel=label, ylim=(0, None))
-    lines, labels = axes[0, 0].get_legend_handles_labels()
+    lines, labels = axes[0].get_legend_handles_labels()
     figure.legend(lines, labels, fontsize=7, frameon=False, loc="outside lower center", ncols=3)
     _save(figure, folder / "force_and_torque.svg")
 

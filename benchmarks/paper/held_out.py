@@ -51,18 +51,13 @@ class HeldOutGrasp(Grasp):
     def __init__(self, config: GraspConfig, hand: Hand, names: tuple[str, ...] = NAMES):
         super().__init__(config, hand)
         shapes = [shape_of(name) for name in names]
-        self.shape_names = names
+        self.shape_names = self.drawn_shapes = names
         self.slots = SLOTS
         self._table: Any = {field: np.stack([shape[field] for shape in shapes]) for field in shapes[0]}
         self.largest = self._table["size"].max(0)
         self._mass = np.array([HEAVY.get(name, config.objects.mass) for name in names], np.float32)
         # Mass stays as the pool has it, since heavy objects have a range of their own.
         self.object_ranges = tuple(f"objects.{name}" for name in PROPERTY_RANGES if name != "mass")
-
-    @property
-    def drawn_shapes(self) -> tuple[str, ...]:
-        """All of the catalogue."""
-        return self.shape_names
 
     def sample_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object, of a random or the given index of the catalogue."""

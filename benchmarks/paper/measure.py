@@ -30,8 +30,6 @@ from paper.held_out import NAMES, HeldOutGrasp
 TOUCH = ("contact_force", "contact_centre")
 HELD_OUT_POOL = 480
 FOREIGN = str(ROOT / "assets" / "plants" / "foreign_right.xml")
-NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
-"""A preset's own budget of training does not count."""
 
 
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
@@ -98,7 +96,7 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[str, dict[
                 ppo=dataclasses.replace(ppo, **changes),
                 preset=budget.preset,
                 backend=budget.backend,
-                **NO_LIMIT | budget.training[row.skill],
+                **budget.training[row.skill],
                 seed=seed,
                 run_dir=folder,
                 video=False,
@@ -202,9 +200,6 @@ def trials(
     }
     reports = zero_shot.run_all(options, budget.trials[skill], budget.processes, show=False)
     return zero_shot.metrics(task, policy, reports) | {"trials": len(reports)}
-
-
-# --- objects that no training has seen -------------------------------------------------------------------
 
 
 def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Tables of the experiments: a header and rows of text, made from the reports."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 from paper.data import Experiment, Row
@@ -9,17 +9,17 @@ Reports = dict[str, dict[str, Any]]
 UNTRAINED = "not trained yet"
 
 
-def cell(entries: Iterable[dict[str, Any] | None], digits: int = 3) -> str:
+def cell(entries: Iterable[dict[str, Any] | None]) -> str:
     """A number with its interval: of one seed the 95 % interval over episodes, of several the lowest and highest."""
     valid = [entry for entry in entries if entry and _middle(entry) is not None]
     if not valid:
         return ""
     values = [_middle(entry) for entry in valid]
     if len(values) > 1:
-        return f"{sum(values) / len(values):.{digits}g} ({min(values):.{digits}g}–{max(values):.{digits}g})"
+        return f"{sum(values) / len(values):.3g} ({min(values):.3g}–{max(values):.3g})"
     low, high = valid[0].get("low"), valid[0].get("high")
-    span = "" if low is None or high is None else f" ({low:.{digits}g}–{high:.{digits}g})"
-    return f"{values[0]:.{digits}g}{span}"
+    span = "" if low is None or high is None else f" ({low:.3g}–{high:.3g})"
+    return f"{values[0]:.3g}{span}"
 
 
 def percent(entries: Iterable[dict[str, Any] | None]) -> str:
@@ -51,9 +51,6 @@ def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     return f"{count} × {short}{each}, {report['budget']} budget"
 
 
-# --- rotation -------------------------------------------------------------------------------------------
-
-
 def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """The paper's columns beside ours in simulation and on the emulated hand."""
     paper = any(row.paper for row in experiment.rows)
@@ -69,10 +66,12 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
         if paper:
             line.append(row.paper["mean / median / s each / s to fall"])
         key = "paper_successes" if row.task == "rotate_paper" else "successes"
+        # Seconds a success over all the time that trials lasted.
+        pace = [s["seconds_to_fall"]["mean"] / s[key]["mean"]["mean"] for s in simulated if s[key]["mean"]["mean"]]
         line += [
             cell(s[key]["mean"] for s in simulated),
             cell(s[key]["median"] for s in simulated),
-            cell(_seconds_each(s[key]["mean"]["mean"], s["seconds_to_fall"]["mean"]) for s in simulated),
+            cell({"mean": seconds} for seconds in pace),
             cell(s["seconds_to_fall"] for s in simulated),
         ]
         if hand:
@@ -105,14 +104,6 @@ def touch_map(experiment: Experiment, reports: Reports) -> list[list[str]]:
         cells += [cell(mean_turns(seed, way) for seed in pair[0]) for way in ("ablated", "another")]
         lines.append([row.label, *cells, how(experiment, row, reports.get(row.name))])
     return lines
-
-
-def _seconds_each(count: float, seconds: float) -> dict[str, Any]:
-    """Seconds a success over all the time that trials lasted."""
-    return {"mean": seconds / count if count else None}
-
-
-# --- grasp ----------------------------------------------------------------------------------------------
 
 
 def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
@@ -179,24 +170,18 @@ def _object(name: str, row: dict[str, Any]) -> list[str]:
     return [name, percent([row["held"]]), *(cell([row[key]]) for key in ("r_resultant", "r_taxels", "force_error_n"))]
 
 
-# --- sweeps ---------------------------------------------------------------------------------------------
-
-
 def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """Success at the measured points of each parameter."""
     lines = [["sweep", "**value**: grasps held [%] and r of the force, or cubes kept [%] and quarter turns a minute"]]
     for row in experiment.rows:
         points = [point for seed in seeds(reports.get(row.name)) for point in seed["points"]]
-        texts = [_point(row.skill)(point) for point in points]
+        texts = [_point(row.skill, point) for point in points]
         lines.append([row.label, "; ".join(texts) or "not measured yet"])
     return lines
 
 
-def _point(skill: str) -> Callable[[dict[str, Any]], str]:
-    def text(point: dict[str, Any]) -> str:
-        name = "" if point["point"] is None else f"**{point['point']:.3g}**: "
-        if skill == "grasp":
-            return f"{name}{percent([point['held']])}, {cell([{'r': point['r_resultant']['r']}])}"
-        return f"{name}{percent([point['kept_to_the_end']])}, {cell([point['successes_per_minute']])}"
-
-    return text
+def _point(skill: str, point: dict[str, Any]) -> str:
+    name = "" if point["point"] is None else f"**{point['point']:.3g}**: "
+    if skill == "grasp":
+        return f"{name}{percent([point['held']])}, {cell([{'r': point['r_resultant']['r']}])}"
+    return f"{name}{percent([point['kept_to_the_end']])}, {cell([point['successes_per_minute']])}"

@@ -81,17 +81,11 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
     """Write a dataset, one episode for each trajectory, whole or not at all; returns its folder.
 
     Args:
-      folder: must not exist yet.
+      folder: must not exist yet (`check_lerobot`).
       hand: whose trajectories they are.
       task: what was done, a phrase.
       trajectories: at least one.
-
-    Raises:
-      DexsimError: pyarrow is not installed, the folder exists, or there is no trajectory.
     """
-    check_lerobot(folder)
-    if not trajectories:
-        raise DexsimError(f"{folder}: no trajectory to write")
     columns: dict[str, list[np.ndarray]] = {}
     episodes, begin = [], 0
     for number, trajectory in enumerate(trajectories):

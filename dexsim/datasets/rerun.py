@@ -1,6 +1,6 @@
 """Signals and taxels as a recording for the rerun viewer (extra `rerun`)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +9,11 @@ from dexsim.core.install import require
 from dexsim.hand.description import Hand
 from dexsim.render.panel import taxel_image
 
-Series = Mapping[str, tuple[Sequence[str], np.ndarray]]
-"""Values [T, n] and the names of their columns, by entity."""
 
-
-def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path) -> None:
-    """Write signals at times [T] s, and taxels [T, F, N] N as pictures, in a recording at `path`.
+def show_rerun(
+    hand: Hand, time: np.ndarray, series: Mapping[str, np.ndarray], taxel_force: np.ndarray, path: Path
+) -> None:
+    """Write signals [T, ...] by name at times [T] s, and taxels [T, F, N] N as pictures, in a recording at `path`.
 
     Raises:
       DexsimError: rerun is not installed.
@@ -27,7 +26,10 @@ def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.nda
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()  # Its error names the file; rerun's does not.
     recording.save(path)
-    for entity, (labels, values) in series.items():
+    names = {hand.num_joints: hand.joint_names, hand.num_fingers: hand.finger_names}
+    for entity, signal in series.items():
+        values = signal.reshape(len(time), -1)
+        labels = names.get(values.shape[1], [f"{entity} {i}" for i in range(values.shape[1])])
         recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
         recording.send_columns(entity, [rerun.TimeColumn("run", duration=time)], rerun.Scalars.columns(scalars=values))
     top = max(float(np.max(taxel_force)), 1e-3)

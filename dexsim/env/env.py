@@ -36,7 +36,6 @@ from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.physics import Physics, revert_if_diverged
 from dexsim.randomization import sample_hand, tilted_down
 from dexsim.sensing.imu import sample_imu
-from dexsim.sensing.taxels import TaxelArray
 from dexsim.task_spec import TaskSpec, correct_readings
 from dexsim.touch.taxel_force import compute_touch, project_on_normals
 
@@ -79,8 +78,7 @@ class Env:
         """A new episode from this start state, with the task's goal or the given one: its poses and shape, with the
         object's physical properties, hand and sensors drawn by `key`."""
         key, hand_key, goal_key, noise_key, sensor_key, object_key = jax.random.split(key, 6)
-        keys = hand_key, sensor_key, object_key
-        episode = sample_episode(self.task, self.hand, self.sensors.taxels, keys, start.object, scale)
+        episode = sample_episode(self.sensors, (hand_key, sensor_key, object_key), start.object, scale)
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         joints = start.qpos[self.physics.joint_qpos]
@@ -122,7 +120,8 @@ class Env:
         law = self.motors.law(hand, command)
         push = self.task.push(push_key, episode.object) + self._tilt_force(episode)
         held, delta = self.task.held(state.goal), hand.pad_thickness_delta
-        result = self.physics.advance(law, episode.object, state.physics, push, state.tip_stiffness, delta, held)
+        fields = self.physics.fields(episode.object, state.tip_stiffness, delta)
+        result = self.physics.advance(law, fields, state.physics, push, held)
         result, finite = revert_if_diverged(result, state.physics, command.valid)
         torque = self.motors.current_torque(hand, command, result.state)
         truth = self._ground_truth(episode, result, torque, command.action, state.action)
@@ -258,12 +257,7 @@ class Env:
 
 
 def sample_episode(
-    task: Task,
-    hand: Hand,
-    taxels: TaxelArray,
-    keys: tuple[jax.Array, jax.Array, jax.Array],
-    object: ObjectParams,
-    scale: jax.Array | None = None,
+    sensors: SensorSuite, keys: tuple[jax.Array, ...], object: ObjectParams, scale: jax.Array | None = None
 ) -> Episode:
     """What an episode draws at its start: the hand, the object's properties, the IMU and the taxels.
 
@@ -274,7 +268,8 @@ def sample_episode(
       scale: [] in [0, 1], narrows every range about nominal; None for 1.
     """
     hand_key, sensor_key, object_key = keys
-    config, ranges, period = task.config, task.config.randomization, task.config.physics.control_period
+    task, config, period = sensors.task, sensors.config, sensors.period
+    ranges = config.randomization
     if drawn := tuple(name.removeprefix("objects.") for name in task.object_ranges):
         object = resample_properties(object_key, object, config.objects, task.unit_inertia(object), drawn)
     if scale is not None:
@@ -283,10 +278,10 @@ def sample_episode(
     times = {"timestep": config.physics.timestep, "control_period": period}
     extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
     return Episode(
-        hand=sample_hand(hand_key, ranges, hand, **times, scale=width),
+        hand=sample_hand(hand_key, ranges, sensors.hand, **times, scale=width),
         object=object,
         imu=sample_imu(sensor_key, config.sensing.orientation, ranges.scale * width, period, extreme),
-        taxels=taxels.sample(jax.random.fold_in(sensor_key, 1), width),
+        taxels=sensors.taxels.sample(jax.random.fold_in(sensor_key, 1), width),
     )
 
 

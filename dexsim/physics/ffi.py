@@ -23,11 +23,12 @@ _MAJOR, _METADATA, _EXECUTE, _STRING = 0, 1, 3, 4
 _INTERNAL = 13
 # XLA's numbers of the types that cross as NumPy arrays.
 _DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 9: np.uint64, 11: np.float32, 12: np.float64}
+# What most structures begin with; the metadata's have the size alone.
+_HEAD = ("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)
 
 
-def _struct(name: str, *fields: tuple[str, Any]) -> Any:
-    head = [("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
-    return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields]})
+def _struct(name: str, *fields: tuple[str, Any], head: int = len(_HEAD)) -> Any:
+    return type(name, (ctypes.Structure,), {"_fields_": [*_HEAD[:head], *fields]})
 
 
 _POINTERS = ctypes.POINTER(ctypes.c_void_p)
@@ -59,6 +60,15 @@ _Attributes = _struct(
     ("names", _POINTERS),
     ("items", _POINTERS),
 )
+_Span = _struct("_Span", ("data", ctypes.c_void_p), ("size", ctypes.c_size_t), head=0)
+_Metadata = _struct("_Metadata", ("version", _Version), ("traits", ctypes.c_uint32), head=1)
+_MetadataRequest = _struct(
+    "_MetadataRequest",
+    ("type", ctypes.c_int),
+    ("next", ctypes.c_void_p),
+    ("metadata", ctypes.POINTER(_Metadata)),
+    head=1,
+)
 Frame = _struct(
     "Frame",
     ("api", ctypes.POINTER(_Api)),
@@ -68,26 +78,6 @@ Frame = _struct(
     ("results", Buffers),
     ("attributes", _Attributes),
 )
-
-
-class _Span(ctypes.Structure):
-    _fields_ = [("data", ctypes.c_void_p), ("size", ctypes.c_size_t)]
-
-    def read(self) -> bytes:
-        return ctypes.string_at(self.data, self.size)
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32)]
-
-
-class _MetadataRequest(ctypes.Structure):
-    _fields_ = [
-        ("struct_size", ctypes.c_size_t),
-        ("type", ctypes.c_int),
-        ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),
-    ]
 
 
 def addresses(buffers: Any) -> list[int]:
@@ -110,8 +100,8 @@ def attributes(frame: Any) -> dict[str, bytes]:
     fields, strings = frame.attributes, {}
     for index in range(fields.size):
         if fields.types[index] == _STRING:
-            name = _Span.from_address(fields.names[index]).read().decode()
-            strings[name] = _Span.from_address(fields.items[index]).read()
+            name, value = (_Span.from_address(place[index]) for place in (fields.names, fields.items))
+            strings[ctypes.string_at(name.data, name.size).decode()] = ctypes.string_at(value.data, value.size)
     return strings
 
 

@@ -71,12 +71,11 @@ class MjxBackend:
         force = jnp.sum(frame * local[..., None], 1)
         touching = (touch.dist[use] < touch.includemargin[use])[:, None]
         force = jnp.where(touching, force, 0.0)
-        finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
-        is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
-        # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
-        on_second = is_object[None, :, 0].astype(jnp.float32) * jax.nn.one_hot(finger[:, 1], fingers).T
-        on_first = is_object[None, :, 1].astype(jnp.float32) * jax.nn.one_hot(finger[:, 0], fingers).T
-        return jnp.sum((on_second - on_first)[..., None] * force[None], 1)
+        # The force acts on geom2; geom1 feels the opposite. The object is no finger's, and not twice in a pair.
+        finger = jnp.max(jnp.asarray(self._finger_of_geom)[touch.geom[use]], -1)
+        first, second = jnp.asarray(self._is_object_geom, jnp.float32)[touch.geom[use]].T
+        share = (first - second)[None] * jax.nn.one_hot(finger, fingers).T
+        return jnp.sum(share[..., None] * force[None], 1)
 
 
 def _step(model: Any, data: Any) -> Any:

@@ -95,28 +95,20 @@ class Physics:
         self._pad_centre, self._pad_radius = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
 
     def advance(
-        self,
-        law: TorqueLaw,
-        object: ObjectParams,
-        state: PhysicsState,
-        push: jax.Array,
-        tip_stiffness: jax.Array | None = None,
-        pad_thickness_delta: jax.Array | float = 0.0,
-        held: jax.Array | None = None,
+        self, law: TorqueLaw, fields: Fields, state: PhysicsState, push: jax.Array, held: jax.Array | None = None
     ) -> StepResult:
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
 
         Args:
           law: the motors, called before every sub-step.
-          object: the object.
+          fields: of the environment (`fields`).
           state: where to start from.
           push: [3] N, force on the object's centre of mass during the whole tick.
-          tip_stiffness, pad_thickness_delta: see `fields`.
           held: [] bool, whether somebody holds the object: weightless, it is where it was at the end; None for no.
         """
         if held is not None:
-            push = jnp.where(held, -object.mass * jnp.asarray(self.mj_model.opt.gravity, jnp.float32), push)
-        fields = self.fields(object, tip_stiffness, pad_thickness_delta)
+            weight = fields["body_mass"] * jnp.asarray(self.mj_model.opt.gravity, jnp.float32)
+            push = jnp.where(held, -weight, push)
         result = self.engine.advance(fields, state, implicit(law, self.config.timestep), push)
         if held is None:
             return result

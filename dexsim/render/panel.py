@@ -4,9 +4,6 @@ Drawn with Pillow and NumPy: matplotlib would cost more than the rest of a frame
 seen from outside: column 0 at the left, row 0 (base of the fingertip) at the bottom; taxel index = column * rows + row.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -19,6 +16,10 @@ INK, FAINT, PANEL, EMPTY, ACCENT = ((233, 236, 241), (138, 146, 160), (24, 27, 3
 _INFERNO = """
 1e0c45 380962 510e6c 69166e 801f6c 982766 b0315b c63d4d d94d3d e9612b f47918 fa9407 fcb014 f8cd37 f2ea69 fcffa4
 """
+_KNOWN = np.array([tuple(bytes.fromhex(color)) for color in _INFERNO.split()])
+_PLACE = np.linspace(0, len(_KNOWN) - 1, 256)
+_COLORS = np.stack([np.interp(_PLACE, np.arange(len(_KNOWN)), channel) for channel in _KNOWN.T], -1)
+_COLORS = _COLORS.round().astype(np.uint8)  # sRGB [256, 3]
 _GAP = 1  # pixels between two cells
 TRUE, FELT = ("maps: taxel force", "bars: contact force"), ("maps: taxel force", "bars: their sum")
 """Captions of a panel whose bars show the simulation's contact forces, or what the taxels feel."""
@@ -32,17 +33,8 @@ def taxel_image(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
 
 def force_color(force: np.ndarray, force_range: float) -> np.ndarray:
     """sRGB bytes [..., 3] of forces [...] on the perceptual colour scale from 0 to `force_range`, both in N."""
-    table = _color_table()
     level = np.nan_to_num(np.asarray(force, np.float64) / force_range)
-    return table[np.clip(level * (len(table) - 1), 0, len(table) - 1).astype(int)]
-
-
-@lru_cache(maxsize=1)
-def _color_table() -> np.ndarray:
-    known = np.array([tuple(bytes.fromhex(color)) for color in _INFERNO.split()])
-    place = np.linspace(0, len(known) - 1, 256)
-    table = [np.interp(place, np.arange(len(known)), channel) for channel in known.T]
-    return np.stack(table, -1).round().astype(np.uint8)
+    return _COLORS[np.clip(level * (len(_COLORS) - 1), 0, len(_COLORS) - 1).astype(int)]
 
 
 @lru_cache(maxsize=8)
@@ -53,22 +45,16 @@ def _font(size: int):
 
 
 def draw_panel(
-    hand: Hand,
-    size: tuple[int, int],
-    snapshot: Snapshot,
-    force_range: float,
-    finger_range: float,
-    lines: Mapping[str, str],
-    captions: tuple[str, str] = TRUE,
+    hand: Hand, size: tuple[int, int], snapshot: Snapshot, force_range: float, finger_range: float, live: bool = False
 ) -> np.ndarray:
     """A panel of `size` (width, height) pixels, uint8 [height, width, 3]: two columns of blocks, the fingers in order
-    and the read-outs last.
+    and last the read-outs, which a `live` view has elsewhere.
 
-    `lines` are read-outs (`read_outs`), `captions` say what maps and bars show. The bar under a map is the finger's
-    force out of `finger_range` N; its mark is the target.
+    The bar under a map is the finger's force out of `finger_range` N; its mark is the target.
     """
     from PIL import Image, ImageDraw
 
+    captions, lines = (FELT, {}) if live else (TRUE, read_outs(snapshot))
     (columns, rows), count = hand.taxel_grid, (hand.num_fingers + 2) // 2
     font_size = max(8, round(size[1] / 36))
     # A block is a title line, the map and a force bar, with air below.

@@ -17,7 +17,7 @@ from dexsim.core.files import write_atomic
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import Pose, hand_poses
-from dexsim.render.panel import draw_panel, read_outs, taxel_image
+from dexsim.render.panel import draw_panel, taxel_image
 from dexsim.render.picture import Camera, draw_scene
 from dexsim.render.snapshot import Snapshot
 
@@ -130,7 +130,7 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
-        panel = draw_panel(hand, (panel_width, height), frame, force_range, finger_range, read_outs(frame))
+        panel = draw_panel(hand, (panel_width, height), frame, force_range, finger_range)
         return np.concatenate([scene, panel], 1)
 
     return draw

@@ -12,7 +12,7 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.hand.description import Hand
-from dexsim.render.panel import FELT, draw_panel, read_outs
+from dexsim.render.panel import draw_panel, read_outs
 from dexsim.view.scene import Frame, Scene
 
 _PANEL = (300, 560)  # pixels of the taxel maps
@@ -114,4 +114,4 @@ class Viewer:
             words["command"] = f"{frame.command:.2f}, with the force loop {words['command']}"
         self._text.content = "  \n".join(f"{name}: **{word}**" for name, word in words.items())
         ranges = self._taxel_range, self._finger_range
-        self._maps.image = draw_panel(self.source.hand, _PANEL, snapshot, *ranges, {}, FELT)
+        self._maps.image = draw_panel(self.source.hand, _PANEL, snapshot, *ranges, live=True)

@@ -48,8 +48,8 @@ _RUNNING_METRICS = ("return", "length")
 class BraxEnv(Env):
     """A dexsim environment behind brax's interface.
 
-    The brax state holds our state, with random keys as raw data, in `pipeline_state`, and in `info`
-    the key and `time_limit` (1 where the task's time limit was reached and it did not terminate).
+    The brax state holds our state without its random key in `pipeline_state`, and in `info` the key, as raw data, and
+    `time_limit` (1 where the task's time limit was reached and it did not terminate).
     The observation is a dictionary with an array for each group, chosen from by brax's `policy_obs_key` and
     `value_obs_key`.
 
@@ -59,8 +59,6 @@ class BraxEnv(Env):
 
     def __init__(self, env: Any):
         self.env = env
-        # Tells which leaves are random keys: brax cannot carry typed keys through its trainer.
-        self._template = jax.eval_shape(env.reset, jax.random.key(0))
 
     def reset(self, rng: jax.Array) -> State:
         """The start of an episode. `rng`: a raw key, as brax uses, or a typed one."""
@@ -76,7 +74,7 @@ class BraxEnv(Env):
         """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
         after = self.env.restart(self._to_dexsim(state), done.astype(bool))
         info = {**state.info, "key": jax.random.key_data(after.key)}
-        return state.replace(pipeline_state=jax.tree.map(_raw, after), obs=dict(after.obs), info=info)
+        return state.replace(pipeline_state=dataclasses.replace(after, key=None), obs=dict(after.obs), info=info)
 
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:
@@ -107,7 +105,7 @@ class BraxEnv(Env):
         time_limit = state.truncated.astype(jnp.float32) * (1 - terminated)
         own = {name: x.astype(jnp.float32) for name, x in state.metrics.items() if name not in _RUNNING_METRICS}
         return State(
-            pipeline_state=jax.tree.map(_raw, state),
+            pipeline_state=dataclasses.replace(state, key=None),
             obs=dict(state.obs),
             reward=state.reward.astype(jnp.float32),
             done=terminated,
@@ -116,10 +114,9 @@ class BraxEnv(Env):
         )
 
     def _to_dexsim(self, state: State) -> Any:
-        """Our state. The key is `info`'s, since brax's restart rewinds `pipeline_state`."""
-        typed = jax.tree.map(_typed, self._template, state.pipeline_state)
-        key = _typed(self._template.key, state.info["key"])
-        return dataclasses.replace(typed, key=key)
+        """Our state. The key is `info`'s: brax's restart rewinds `pipeline_state`, and its trainer carries no typed
+        keys."""
+        return dataclasses.replace(state.pipeline_state, key=jax.random.wrap_key_data(state.info["key"]))
 
 
 class Episodes(EpisodeWrapper):
@@ -147,15 +144,3 @@ def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomizatio
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: the task draws its own parameters; set its `randomization` config instead")
     return Episodes(VmapWrapper(env), episode_length, action_repeat)
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _raw(leaf: jax.Array) -> jax.Array:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
-def _typed(template: Any, leaf: jax.Array) -> jax.Array:
-    return jax.random.wrap_key_data(leaf) if _is_key(template) else leaf

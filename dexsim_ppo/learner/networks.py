@@ -66,24 +66,6 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
     return x
 
 
-def init_params(
-    key: jax.Array,
-    actor_sizes: tuple[int, ...],
-    critic_sizes: tuple[int, ...],
-    initial_std: float,
-    memory: GRU | None = None,
-) -> Params:
-    """Parameters of both networks, whose sizes are those of the input, of hidden layers and of the output. With memory
-    the carry's size is part of both inputs. The actor's small output gain makes the first actions nearly pure noise."""
-    actor_key, critic_key = jax.random.split(key)
-    return Params(
-        actor=init_mlp(actor_key, actor_sizes, output_gain=0.01),
-        log_std=jnp.full(actor_sizes[-1], jnp.log(initial_std)),
-        critic=init_mlp(critic_key, critic_sizes, output_gain=1.0),
-        memory=memory,
-    )
-
-
 def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.Array, new_std: jax.Array) -> MLP:
     """Change the last layer so that `new_std * out + new_mean` equals the old `std * out + mean`.
 

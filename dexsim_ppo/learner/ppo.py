@@ -21,12 +21,12 @@ from dexsim.core.layout import layout_size
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers
-from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_params, rescale_output, zero_carry
+from dexsim_ppo.learner.networks import Params, carry_size, init_gru, init_mlp, rescale_output, zero_carry
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
 from dexsim_ppo.learner.running_stats import init_stats, merge_moments, value_std
 from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, init_on_mesh, moments, shardings
-from dexsim_ppo.learner.types import Environment, TrainState
-from dexsim_ppo.learner.update import Learner, init_adam, update
+from dexsim_ppo.learner.types import AdamState, Environment, TrainState
+from dexsim_ppo.learner.update import Learner, update
 
 
 class Training(NamedTuple):
@@ -97,14 +97,21 @@ def init_state(
         memory = init_gru(jax.random.fold_in(params_key, 1), sizes["actor"], config.memory_size)
     actor = (sizes["actor"] + carry_size(memory), *config.actor_layers, env.action_size)
     critic = (sizes["critic"] + carry_size(memory), *config.critic_layers, 1)
-    params = init_params(params_key, actor, critic, config.initial_std, memory)
+    actor_key, critic_key = jax.random.split(params_key)
+    params = Params(
+        actor=init_mlp(actor_key, actor, output_gain=0.01),  # a small gain: the first actions are nearly pure noise
+        log_std=jnp.full(env.action_size, jnp.log(config.initial_std)),
+        critic=init_mlp(critic_key, critic, output_gain=1.0),
+        memory=memory,
+    )
+    zeros = jax.tree.map(jnp.zeros_like, params)
     resets, staggers = (jax.random.split(key, config.num_envs) for key in (reset_key, stagger_key))
     scale = jnp.float32(curriculum.start) if curriculum.on else None
     reset = env.reset if scale is None else functools.partial(cast(Any, env).reset, scale=scale)
     return TrainState(
         params=params,
         average=(params.actor, params.memory),
-        adam=init_adam(params),
+        adam=AdamState(jnp.int32(0), zeros, zeros),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()),
@@ -172,9 +179,6 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
     narrower = jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0)
     step = jnp.where(success >= curriculum.widen_above, curriculum.step, narrower)
     return jnp.clip(scale + step, 0.0, 1.0), success
-
-
-# --- advantages ---------------------------------------------------------------------------------------
 
 
 def prepare(

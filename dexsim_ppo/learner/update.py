@@ -108,15 +108,6 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
     return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm}
 
 
-def init_adam(params: Params) -> AdamState:
-    """Zero moments."""
-    return AdamState(
-        count=jnp.zeros((), jnp.int32),
-        mean=jax.tree.map(jnp.zeros_like, params),
-        variance=jax.tree.map(jnp.zeros_like, params),
-    )
-
-
 def step_adam(grads: Params, state: AdamState, params: Params, learning_rate: jax.Array) -> tuple[Params, AdamState]:
     """One step down the gradient: new parameters and moments. `learning_rate` is []."""
     b1, b2, epsilon = 0.9, 0.999, 1e-5

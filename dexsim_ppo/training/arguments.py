@@ -152,9 +152,6 @@ def printable(arguments: TrainArguments) -> dict[str, Any]:
     return {name: value for name, value in to_dict(arguments).items() if name not in paths}
 
 
-# --- fine-tuning --------------------------------------------------------------------------------------
-
-
 def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
     """`config` with the policy's network and normaliser, little noise, small steps, and the critic alone at first.
 

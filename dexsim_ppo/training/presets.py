@@ -20,15 +20,7 @@ Preset = TrainArguments[Any]  # without the options of a task
 # large steps, which become smaller; see `find_preset`.
 _CPU = Preset(
     env=NoSettings(),
-    ppo=PPOConfig(
-        num_envs=256,
-        rollout_length=16,
-        epochs=5,
-        minibatches=4,
-        kl_target=0.02,
-        actor_layers=(128, 128),
-        critic_layers=(128, 128),
-    ),
+    ppo=PPOConfig(num_envs=256, kl_target=0.02, actor_layers=(128, 128), critic_layers=(128, 128)),
     minutes=7.0,
     evaluate_every=20,
     evaluation_chunk=50,
@@ -54,7 +46,6 @@ PRESETS = {
         env=NoSettings(),
         ppo=PPOConfig(
             num_envs=32768,
-            rollout_length=16,
             epochs=4,
             minibatches=16,
             kl_target=0.015,

@@ -321,16 +321,15 @@ def _couplings(model: mujoco.MjModel) -> list[str]:
     zero = [np.where(dof >= 0, model.qpos0[dof], 0.0) for dof in (first, second)]
     compliance = model.dof_invweight0[first] + np.where(second >= 0, model.dof_invweight0[second], 0.0)
     springs = np.hstack([model.eq_solref, model.eq_solimp])
+    rows = [
+        f"{first[k]}, {second[k]}, {_list([zero[0][k], zero[1][k]])}, {_list(model.eq_data[k, :5])}, "
+        f"{_list(springs[k])}, {_number(compliance[k])}"
+        for k in range(model.neq)
+    ]
     return [
         f"constexpr int COUPLINGS = {model.neq};",
         "struct Coupling { int first, second; float zero[2], polynomial[5], spring[7], compliance; };",
-        f"__device__ const Coupling COUPLING[{max(model.neq, 1)}] = {{",
-        *(
-            f"  {{{first[k]}, {second[k]}, {_list([zero[0][k], zero[1][k]])}, {_list(model.eq_data[k, :5])}, "
-            f"{_list(springs[k])}, {_number(compliance[k])}}},"
-            for k in range(model.neq)
-        ),
-        "};",
+        *_table("Coupling", "COUPLING", rows),
     ]
 
 

@@ -103,6 +103,7 @@ class Grasp(Task):
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.posture, self.finger_force = config.posture, force
         self.slots, self.largest = config.objects.slots, config.objects.largest
+        self.drawn_shapes = ("mesh",) if config.objects.mesh else config.objects.shapes  # of `shape_names`, in the pool
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
@@ -179,11 +180,6 @@ class Grasp(Task):
         start = Start(qpos=qpos, qvel=jnp.zeros(hand.num_hinges + 6), object=object)
         return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP
 
-    @property
-    def drawn_shapes(self) -> tuple[str, ...]:
-        """Names, of `shape_names`, of what the pool has."""
-        return ("mesh",) if self.config.objects.mesh else self.config.objects.shapes
-
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         low, high = self.config.release_delay
         delay = jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high)
@@ -254,8 +250,6 @@ class Grasp(Task):
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
         }
-
-    # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, GraspGoal]:
         """Pool rows [count] and goals: five commands for each shape, evenly, never changing."""

@@ -49,11 +49,7 @@ class RotateReward(Config):
 class RotateConfig(EnvConfig):
     """The rotation task, as a right hand does it; a left hand does the mirror image."""
 
-    objects: ObjectConfig = setting(
-        ObjectConfig(
-            shapes=("box",), mass=(0.06, 0.15), friction=(0.4, 1.2), link_friction=(0.3, 0.9), com_offset=0.003
-        )
-    )
+    objects: ObjectConfig = setting(ObjectConfig(shapes=("box",), mass=(0.06, 0.15), link_friction=(0.3, 0.9)))
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. Links have less friction
     than fingertips: with more, random strokes carry the object over the thumb."""
     control: Control = setting(Control(step=0.08, last_action_encoding="target"))
@@ -176,9 +172,7 @@ def any_object() -> RotateConfig:
     either way from its nominal tilt."""
     return dataclasses.replace(
         _PLAIN,
-        objects=ObjectConfig(
-            shapes=("box", "cylinder"), mass=(0.06, 0.15), friction=(0.4, 1.2), link_friction=(0.3, 0.9)
-        ),
+        objects=ObjectConfig(shapes=("box", "cylinder"), mass=(0.06, 0.15), link_friction=(0.3, 0.9)),
         edge=(0.045, 0.065),
         proportions=(0.9, 1.1),
         randomization=Randomization(gravity_tilt=0.4),

@@ -72,9 +72,6 @@ class Progress:
     success: jax.Array  # [] bool
 
 
-# --- small pure functions ----------------------------------------------------------------------
-
-
 def goal_quat(turns: jax.Array | int, axis: jax.Array, angle: jax.Array | float) -> jax.Array:
     """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
     # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
@@ -86,19 +83,6 @@ def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) ->
     """1 / (|d_rot| + 0.1) / (1 + exp(400 (d_goal - gate)))."""
     gate = jax.nn.sigmoid(_STEEPNESS * (weights.gate - distance))
     return gate / (jnp.abs(angle) + _EPSILON)
-
-
-def tips_at_work(duty: jax.Array) -> jax.Array:
-    """min(duty / `WORKING_DUTY`, 1) [] of the least busy of the `WORKING_TIPS` busiest fingertips; `duty` [F].
-
-    With their mean, two busy fingertips would earn most of the bonus, and some seeds use only two.
-    """
-    return jnp.minimum(jnp.sort(duty)[::-1][:WORKING_TIPS] / WORKING_DUTY, 1.0)[-1]
-
-
-def trap_cost(tilt: jax.Array, ahead: jax.Array) -> jax.Array:
-    """2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it."""
-    return (tilt / 0.6) ** 2 + (jnp.maximum(ahead, 0.0) / 0.022) ** 2
 
 
 class Rotate(Task):
@@ -218,7 +202,10 @@ class Rotate(Task):
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, after = self.config.reward, self.progress(goal, truth), self.update(None, goal, truth)
         fallen = dropped.astype(jnp.float32)
-        held, work = 1.0 - fallen, tips_at_work(after.duty)
+        held = 1.0 - fallen
+        # Of the least busy of the busiest fingertips: with their mean, two would earn most of the bonus, and some seeds
+        # use only two.
+        work = jnp.minimum(jnp.sort(after.duty)[::-1][:WORKING_TIPS] / WORKING_DUTY, 1.0)[-1]
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= _FROM_GOAL).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))
@@ -232,7 +219,9 @@ class Rotate(Task):
             "drop": weights.drop * fallen,
         }
         if self.config.trap > 0:
-            terms["trap"] = -trap_cost(self._tilt(truth), truth.object_position[2] - self.reference[2])
+            # 2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it.
+            ahead = jnp.maximum(truth.object_position[2] - self.reference[2], 0.0)
+            terms["trap"] = -((self._tilt(truth) / 0.6) ** 2 + (ahead / 0.022) ** 2)
         ticks = jnp.maximum(after.clock / self._period, 1.0)
         mean = {name: total / ticks for name, total in after.totals.items()}
         turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
@@ -259,8 +248,6 @@ class Rotate(Task):
         own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), self._axis)
         across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
         return jnp.arctan2(across, jnp.sum(own * self._axis))
-
-    # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
         """Rows [count], evenly spread over those of the pool outside the trap; goals that end with a drop only."""

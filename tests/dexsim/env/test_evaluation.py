@@ -23,10 +23,10 @@ def drawn(hand):
     """What 400 episodes draw for each of eight boxes, of which some are extreme: the object, leaves [8, 400, ...]."""
     config, box = GraspConfig(objects=ObjectConfig(extremes=0.5)), jnp.int32(SHAPES.index("box"))
     task = Grasp(config, hand)
-    taxels = SensorSuite(config, hand, task).taxels
+    sensors = SensorSuite(config, hand, task)
 
     def draw(key, object):
-        return sample_episode(task, hand, taxels, jax.random.split(key, 3), object).object
+        return sample_episode(sensors, jax.random.split(key, 3), object).object
 
     def episodes(key, keys):
         return jax.vmap(draw, (0, None))(keys, task.sample_object(key, config, box))

@@ -69,7 +69,7 @@ def test_driven_hinges_keep_their_ratio(coupled):
     def law(index, position, velocity):
         return 1.0 * (goal - position) - 0.05 * velocity
 
-    tick = jax.jit(lambda state: physics.advance(law, box, state, jnp.zeros(3)).state)
+    tick = jax.jit(lambda state: physics.advance(law, physics.fields(box), state, jnp.zeros(3)).state)
     for _ in range(17):
         state = tick(state)
         followers = hinge_angles(coupled, state.qpos[physics.joint_qpos])

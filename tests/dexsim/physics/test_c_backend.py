@@ -44,13 +44,13 @@ def one_step(hand):
     """One sub-step of a batch under given torques, the solver converged."""
     physics = make(hand, substeps=1, iterations=50)
     return jax.jit(
-        jax.vmap(lambda target, state, torque, push: physics.advance(lambda *_: torque, target, state, push))
+        jax.vmap(lambda t, state, torque, push: physics.advance(lambda *_: torque, physics.fields(t), state, push))
     )
 
 
 @pytest.fixture(scope="module")
 def tick(physics):
-    return jax.jit(jax.vmap(lambda target, state, push: physics.advance(hold, target, state, push)))
+    return jax.jit(jax.vmap(lambda target, state, push: physics.advance(hold, physics.fields(target), state, push)))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,9 @@ class TestForces:
     def test_the_default_iterations_are_enough(self, hand, one_step, grips):
         """From a cold start."""
         physics = make(hand, substeps=1)
-        step = jax.jit(jax.vmap(lambda t, s, torque: physics.advance(lambda *_: torque, t, s, jnp.zeros(3))))
+        step = jax.jit(
+            jax.vmap(lambda t, s, torque: physics.advance(lambda *_: torque, physics.fields(t), s, jnp.zeros(3)))
+        )
         target, state, torque = batch_of(grips)
         state = dataclasses.replace(state, warmstart=0 * state.warmstart)
         _, force = step(target, state, torque)
@@ -101,10 +103,10 @@ def test_batches_of_any_size_and_order_loops_and_scans_give_the_same_bits(physic
         part = jax.tree.map(lambda x, rows=rows: x[rows], (target, state, push))
         assert_same(tick(*part), jax.tree.map(lambda x, rows=rows: x[rows], whole))
     one = jax.tree.map(lambda x: x[3], (target, state))
-    single = jax.jit(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3)))(*one)
+    single = jax.jit(lambda t, s: physics.advance(hold, physics.fields(t), s, jnp.zeros(3)))(*one)
     assert_same(single, jax.tree.map(lambda x: x[3], whole))
     square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), (target, state, push))
-    nested = jax.jit(jax.vmap(jax.vmap(lambda t, s, p: physics.advance(hold, t, s, p))))(*square)
+    nested = jax.jit(jax.vmap(jax.vmap(lambda t, s, p: physics.advance(hold, physics.fields(t), s, p))))(*square)
     nested = jax.device_get(nested)
     assert_same(jax.tree.map(lambda x: x.reshape(4, *x.shape[2:]), nested), whole)
     scanned, _ = jax.jit(lambda s: jax.lax.scan(lambda s, _: (tick(target, s, push)[0], None), s, length=3))(state)
@@ -131,7 +133,7 @@ class TestTrouble:
         monkeypatch.setattr(scene_model, "_set_options", cramped)
         target, state, _ = batch_of(grips)
         physics = make(hand)
-        tick = jax.jit(jax.vmap(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3))))
+        tick = jax.jit(jax.vmap(lambda t, s: physics.advance(hold, physics.fields(t), s, jnp.zeros(3))))
         with pytest.raises(jax.errors.JaxRuntimeError, match="<size memory"):
             jax.block_until_ready(tick(target, state))
 
@@ -213,7 +215,7 @@ def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compile
     @functools.cache
     def advance(cover):
         physics, motors = scenes[cover], lambda *_: jnp.asarray(torque)
-        return jax.jit(lambda delta: physics.advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=delta))
+        return jax.jit(lambda delta: physics.advance(motors, physics.fields(object, None, delta), state, jnp.zeros(3)))
 
     (drawn, force), (expected, pressed) = advance(THICK)(change), advance(compiled)(0.0)
     np.testing.assert_allclose(force, pressed, atol=2e-3)

@@ -73,7 +73,7 @@ def tick_of(env, physics):
         target = s.joint_target + 0.1
         command = JointCommand(action=0 * target, target=target, previous=s.joint_target, valid=jnp.array(True))
         law, push = motors.law(s.episode.hand, command), jnp.array([0.1, -0.2, 0.3])
-        result = physics.advance(law, s.episode.object, s.physics, push, s.tip_stiffness)
+        result = physics.advance(law, physics.fields(s.episode.object, s.tip_stiffness), s.physics, push)
         return result, motors.current_torque(s.episode.hand, command, result.state)[0]
 
     return jit(jax.vmap(one), once=True)

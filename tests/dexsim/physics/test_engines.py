@@ -57,7 +57,7 @@ def outcome_on(hand, backend):
             return 2.0 * (target - position) - 0.05 * velocity
 
         held = dataclasses.replace(OBJECT, friction=x[2], mass=x[3])
-        result = physics.advance(law, held, PhysicsState(POSE, SPEED, jnp.zeros(9)), jnp.zeros(3))
+        result = physics.advance(law, physics.fields(held), PhysicsState(POSE, SPEED, jnp.zeros(9)), jnp.zeros(3))
         return jnp.concatenate([result.state.qvel, result.finger_force.ravel()])
 
     return outcome

@@ -28,7 +28,7 @@ def compile_advance(hand, backend):
     physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend=backend)
 
     def one(object, state, torque):
-        return physics.advance(lambda *_: torque, object, state, jnp.zeros(3))
+        return physics.advance(lambda *_: torque, physics.fields(object), state, jnp.zeros(3))
 
     return jit(jax.vmap(one))
 
@@ -89,7 +89,7 @@ def test_cuda_repeats_to_the_bit(hand, grips):
 
     def ticks(object, state, torque):
         def body(state, _):
-            result = physics.advance(lambda *_: torque, object, state, jnp.zeros(3))
+            result = physics.advance(lambda *_: torque, physics.fields(object), state, jnp.zeros(3))
             return result.state, result.finger_force
 
         return jax.lax.scan(body, state, length=50)

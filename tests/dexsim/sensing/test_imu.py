@@ -64,10 +64,10 @@ def test_an_episodes_imu_is_as_wide_as_the_ranges_and_the_curriculum_together(ha
     def drawn(ranges, curriculum):
         config = RotateConfig(randomization=Randomization(scale=ranges))
         task, keys = Rotate(config, hand), jax.random.split(jax.random.key(1), 3)
-        taxels = SensorSuite(config, hand, task).taxels
+        sensors = SensorSuite(config, hand, task)
 
         def draw(keys, scale):
-            return sample_episode(task, hand, taxels, keys, task.sample_object(keys[0], config), scale).imu
+            return sample_episode(sensors, keys, task.sample_object(keys[0], config), scale).imu
 
         return jax.jit(draw)(tuple(keys), jnp.float32(curriculum))
 

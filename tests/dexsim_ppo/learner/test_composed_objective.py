@@ -18,7 +18,7 @@ from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import AdaptedState
 from dexsim_ppo.learner.loss import loss
-from dexsim_ppo.learner.networks import init_params
+from dexsim_ppo.learner.networks import Params, init_mlp
 from dexsim_ppo.learner.running_stats import RunningStats
 from dexsim_ppo.learner.types import TrainState
 
@@ -71,9 +71,8 @@ class Script:
 def setting(seed, **options):
     """The learner amid training: script, configuration, parameters, statistics, and a step of the update."""
     rng, config = np.random.default_rng(seed), dataclasses.replace(CONFIG, **options)
-    params = init_params(
-        jax.random.key(seed), actor_sizes=(4, 6, 4, ACTIONS), critic_sizes=(4, 5, 1), initial_std=config.initial_std
-    )
+    networks = (init_mlp(jax.random.key(seed), sizes, 1.0) for sizes in ((4, 6, 4, ACTIONS), (4, 5, 1)))
+    params = Params(next(networks), jnp.full(ACTIONS, jnp.log(config.initial_std)), next(networks))
     change = lambda size: jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape), x.dtype), params)  # noqa: E731
     params = jax.tree.map(jnp.add, params, change(0.4))
     single = lambda *x: RunningStats(jnp.int32(30), *(jnp.asarray(v, jnp.float32) for v in x))  # noqa: E731

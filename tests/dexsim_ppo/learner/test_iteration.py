@@ -18,7 +18,8 @@ from dexsim_ppo.learner.networks import init_mlp
 from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments
-from dexsim_ppo.learner.update import Learner, adapt_learning_rate, init_adam, step_adam
+from dexsim_ppo.learner.types import AdamState
+from dexsim_ppo.learner.update import Learner, adapt_learning_rate, step_adam
 
 UPDATES = dataclasses.replace(SMALL, epochs=3, minibatches=4, kl_target=0.0)
 RATE, COUNT, BLOCKS = UPDATES.learning_rate, UPDATES.steps_per_iteration, 2
@@ -220,7 +221,7 @@ def test_adam_against_numpy():
     rng = np.random.default_rng(0)
     parameters, mean, square = rng.normal(size=3), 0.0, 0.0
     got = jnp.float32(parameters)
-    state = init_adam(got)
+    state = AdamState(jnp.int32(0), *[jax.tree.map(jnp.zeros_like, got)] * 2)
     for t, grad in enumerate(rng.normal(size=(5, 3)), start=1):
         got, state = step_adam(jnp.float32(grad), state, got, 0.01)
         mean, square = 0.9 * mean + 0.1 * grad, 0.999 * square + 0.001 * grad**2

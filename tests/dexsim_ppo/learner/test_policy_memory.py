@@ -85,7 +85,7 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     for _ in range(8):  # 80 iterations
         state, _ = training.step(state)
     policy = Policy.from_training(env, config, state)
-    report = evaluate_policy(policy, env=env, episodes=256, chunk=256, baseline=False)
+    report = evaluate_policy(policy, env=env, episodes=256)
     error = report["task"]["headline"]["error"]
     # The mean of |number| is 0.5, and the first of six steps shows it.
     assert error > 0.35 if kind == "none" else error < 0.1

@@ -176,7 +176,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(what, finished, tmp_path, 
 
 
 def test_another_environment_than_the_policys_is_warned_of(finished, monkeypatch):
-    monkeypatch.setattr(evaluate, "_measure", lambda *_: ({}, None))
+    monkeypatch.setattr(evaluate, "_measure", lambda *_, **__: ({}, None))
     with pytest.warns(OtherEnvWarning, match=r"gain = 0\.5 \(trained: 0\.25\)"):
         evaluate.evaluate_policy(finished.best, env=TinyEnv(TinyConfig(gain=0.5)))
 
