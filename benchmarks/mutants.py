@@ -32,17 +32,18 @@ from cosmic_ray.work_item import TestOutcome
 
 ROOT = Path(__file__).resolve().parents[1]
 _RUN = "tests/dexsim_real/run tests/dexsim_real/calibrate/test_procedure.py tests/dexsim_real/twin/test_twin_virtual.py"
-_ENV = "tests/dexsim/env tests/dexsim/tasks"
+_CONFIG, _ENV = "tests/dexsim/core/test_config.py", "tests/dexsim/env tests/dexsim/tasks"
+_OBSERVED = "tests/dexsim/test_observation.py tests/dexsim/hand/test_mirror.py"
 _SHIPPED = "tests/dexsim_ppo/test_shipped_policy.py"
 TESTS = {
-    "dexsim_real/control": f"tests/dexsim_real/control {_RUN}",
-    "dexsim_real/sensors": f"tests/dexsim_real/sensors tests/dexsim_real/control {_RUN}",
-    "dexsim_ppo/learner": "tests/dexsim_ppo/learner tests/dexsim_ppo/training",
-    "dexsim/env": "tests/dexsim/env tests/dexsim/tasks tests/dexsim/test_randomization.py",
-    "dexsim/tasks": "tests/dexsim/tasks tests/dexsim/env tests/dexsim_ppo/test_evaluator.py",
-    "dexsim/touch": f"tests/dexsim/touch {_ENV}",
+    "dexsim_real/control": f"{_CONFIG} tests/dexsim_real/control tests/dexsim_real/sensors {_RUN}",
+    "dexsim_real/sensors": f"{_CONFIG} tests/dexsim_real/sensors tests/dexsim_real/control {_RUN}",
+    "dexsim_ppo/learner": f"{_CONFIG} tests/dexsim_ppo/learner tests/dexsim_ppo/training",
+    "dexsim/env": f"{_CONFIG} {_ENV} tests/dexsim/test_randomization.py tests/dexsim/test_registry.py",
+    "dexsim/tasks": f"{_CONFIG} {_ENV} {_SHIPPED} tests/dexsim_real/twin/plant/test_parameters.py",
+    "dexsim/touch": f"{_CONFIG} tests/dexsim/touch tests/dexsim/test_control.py {_ENV}",
     "dexsim/actuator": f"tests/dexsim/actuator {_ENV} tests/dexsim/identification",
-    "dexsim/observation.py": f"tests/dexsim/test_observation.py tests/dexsim/hand/test_mirror.py {_ENV} {_SHIPPED}",
+    "dexsim/observation.py": f"{_CONFIG} {_OBSERVED} {_ENV} {_SHIPPED}",
 }
 """Tests that can notice a change in a folder or module, the nearest first."""
 _PAIRS = "Add_Sub Sub_Add Mul_Div Div_Mul Pow_Mul BitAnd_BitOr BitOr_BitAnd".split()

@@ -6,7 +6,7 @@ know which world it is in. Shapes: J joints, F fingers, N taxels a finger.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +51,7 @@ class Motion:
     object_spin: jax.Array  # [3] rad/s, palm frame
 
 
-@dataclasses.dataclass(frozen=True)
-class Features:
+class Features(NamedTuple):
     """What the fields are made of."""
 
     hand: Hand
@@ -64,8 +63,7 @@ class Features:
     contact_centre: jax.Array  # [F, 3] m
 
 
-@dataclasses.dataclass(frozen=True)
-class ObservationField:
+class ObservationField(NamedTuple):
     """A named piece of an observation, a row of `_FIELDS`: all there is to know about it."""
 
     name: str
@@ -193,7 +191,7 @@ def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tup
     readings = Readings(joints, joints, taxels, vector, vector, quat, quat, command, joints, past, vector)
     parts = jax.eval_shape(lambda: _compute(hand, readings, names, config, Motion(joints, vector)))
     fields = [FIELDS[name] for name in select_fields(names, config)]
-    return tuple(LayoutEntry(field.name, part.size, field.scale) for field, part in zip(fields, parts, strict=True))
+    return tuple(map(LayoutEntry, (f.name for f in fields), (part.size for part in parts), (f.scale for f in fields)))
 
 
 def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:

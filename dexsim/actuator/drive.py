@@ -5,6 +5,8 @@ the paper's text names and leaves out: torque ripple, an encoder that is off, fr
 pytree leaf: drawn per joint and episode, differentiated, fitted.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -15,7 +17,8 @@ from dexsim.core.pytree import Array, pytree_dataclass
 class Actuator:
     """Parameters of one joint's drive (scalars) or of all of them ([J]).
 
-    Those that may be None are not modelled then; 0 gives the same numbers, bit for bit.
+    Those that may be None are not modelled then; 0 gives the same numbers, bit for bit. Ripple needs its count and
+    phase, `apply_friction` both kinds of friction.
     """
 
     stiffness: jax.Array  # k_p, Nm/rad
@@ -25,11 +28,11 @@ class Actuator:
     no_load_speed: jax.Array  # qd_max, rad/s
     efficiency: jax.Array  # eta, 1
     ripple: jax.Array | None = None  # r, share of the torque
-    ripple_count: jax.Array | None = None  # n, ripples per radian of the joint
-    ripple_phase: jax.Array | None = None  # rad
+    ripple_count: Any = None  # n, ripples per radian of the joint
+    ripple_phase: Any = None  # rad
     encoder_bias: jax.Array | None = None  # rad, measured minus true angle, inside the loop too
-    coulomb_friction: jax.Array | None = None  # c, Nm
-    viscous_friction: jax.Array | None = None  # b, Nm s/rad
+    coulomb_friction: Any = None  # c, Nm
+    viscous_friction: Any = None  # b, Nm s/rad
 
 
 def pd_torque(
@@ -74,7 +77,6 @@ def joint_torque(
     torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
     if actuator.ripple is None:
         return torque
-    assert actuator.ripple_count is not None and actuator.ripple_phase is not None
     angle = actuator.ripple_count * position + actuator.ripple_phase
     return torque * (1.0 + actuator.ripple * jnp.sin(angle))
 
@@ -106,11 +108,8 @@ def apply_friction(
       velocity: rad/s, before the sub-step.
       inertia_rate: Nm s/rad, the joint's inertia over the sub-step, I / dt.
     """
-    if actuator.coulomb_friction is None and actuator.viscous_friction is None:
-        return torque
+    coulomb, viscous = actuator.coulomb_friction, actuator.viscous_friction
     rate = inertia_rate * velocity + torque
-    coulomb = 0.0 if actuator.coulomb_friction is None else actuator.coulomb_friction
-    viscous = 0.0 if actuator.viscous_friction is None else actuator.viscous_friction
     held = jnp.clip(rate, -coulomb, coulomb)
     return torque - held - (rate - held) * (viscous / (inertia_rate + viscous))
 

@@ -195,9 +195,10 @@ class Env:
         pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
         if self.config.touch_method != "closed_form" or skin.margin != thickness:
             # The contact's springs have the geometry and the rubber of the solver.
-            shape, bare, cover = object.shape(), jnp.ones(hand.num_fingers), jnp.maximum(delta, -thickness)
-            bearing = compute_touch(hand, pose, shape, position, rotation, bare, skin, cover)
-        skin_force = jnp.sum(bearing.skin_force, -1)
+            shape, bare = object.shape(), jnp.ones(hand.num_fingers)
+            rubber = dataclasses.replace(skin, margin=thickness)
+            bearing = compute_touch(hand, pose, shape, position, rotation, bare, rubber, delta)
+        skin_force = jnp.sum(bearing.skin_force, 1)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -206,7 +207,7 @@ class Env:
             torque_limited=torque[1],
             pose=pose,
             finger_force=force,
-            normal_force=jnp.sum(pressed.force, -1),
+            normal_force=jnp.sum(pressed.force, 1),
             touch=pressed if skin.total == "pressing" else touch,
             tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, skin_force, delta),
             object_position=position,

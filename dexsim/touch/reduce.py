@@ -36,9 +36,9 @@ def reduce_touch(force: jax.Array, taxels: jax.Array, weighting: str = "force") 
       weighting: "force" (or "depth"): mu_i = sum f_ij p_ij / F_i; "none": mean of active taxels.
     """
     weight = (force > 0).astype(force.dtype) if weighting == "none" else force
-    total = jnp.sum(weight, -1)
-    centre = jnp.sum(weight[..., None] * taxels, -2) / jnp.where(total > 0, total, 1.0)[:, None]
-    return jnp.sum(force, -1), centre
+    total = jnp.sum(weight, 1)
+    centre = jnp.sum(weight[..., None] * taxels, 1) / jnp.where(total > 0, total, 1.0)[:, None]
+    return jnp.sum(force, 1), centre
 
 
 def reduce_touch_links(
@@ -54,7 +54,7 @@ def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, 
     """Estimated force [F] N of each finger: the sum of its `taxel_force` [F, N] N and a share of what its
     `joint_torque` [J], over the torque limits, tells beyond it by the hand's `force_per_torque`; 0 without touch.
     """
-    taxels = jnp.sum(taxel_force, -1)
+    taxels = jnp.sum(taxel_force, 1)
     gain = hand.force_per_torque * hand.torque_limit[hand.root_joint]
     beyond = jnp.maximum(gain * jnp.abs(joint_torque[hand.root_joint]) - taxels, 0.0)
     return jnp.where(taxels > estimate.touching, taxels + estimate.torque_share * beyond, 0.0)

@@ -51,7 +51,7 @@ def compute_touch(
       pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
     """
     # From the links' frames directly to the object's: one transform a finger instead of two a taxel.
-    turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
+    turn = rotations.compose(rotation.T, pose.tip_rotation)
     shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position[None])
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
@@ -65,7 +65,7 @@ def compute_touch(
 
 def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
     """Share each finger's force [F] among its taxels in proportion to `skin_force` [F, N]."""
-    total = jnp.sum(skin_force, -1, keepdims=True)
+    total = jnp.sum(skin_force, 1, keepdims=True)
     return finger_force[:, None] * skin_force / jnp.where(total > 0, total, 1.0)
 
 
@@ -74,8 +74,8 @@ def project_on_normals(touch: Touch, normals: jax.Array, finger_force: jax.Array
 
     Outward taxel `normals` [F, N, 3] are in the same frame, whichever. A finger that touches nothing keeps 0.
     """
-    inward = -jnp.sum(touch.skin_force[..., None] * normals, -2)
-    square = jnp.sum(inward**2, -1, keepdims=True)
+    inward = -jnp.sum(touch.skin_force[..., None] * normals, 1)
+    square = jnp.sum(inward**2, 1, keepdims=True)
     inward = inward / jnp.sqrt(jnp.where(square > 0, square, 1.0))  # the gradient of a norm is NaN at 0
-    pressing = jnp.sum(finger_force * inward, -1)
+    pressing = jnp.sum(finger_force * inward, 1)
     return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressing, 0.0)))

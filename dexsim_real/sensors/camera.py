@@ -150,7 +150,7 @@ class ObjectEstimate(NamedTuple):
     palm_gravity: np.ndarray = np.zeros(3)  # [3] unit vector
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass
 class ObjectSensors:
     """Camera and IMU, None without one. What neither measures is nominal."""
 

@@ -95,6 +95,13 @@ def test_the_observation_is_the_papers_without_what_an_ablation_leaves_out(
     assert found == ([*(name for name in ORDER[names].split() if name not in leave_out), *more], size + 27)
 
 
+def test_touch_commands_and_actions_have_a_scale_of_their_own():
+    """In the fields' units. A policy carries them: with others it is refused as one of another version."""
+    scale = {name: field.scale for name, field in FIELDS.items() if field.scale is not None}
+    fixed = {"joint_torque": 0.3, "contact_force": 5.0, "contact_centre": 0.1, "finger_force": 5.0, "command": 0.5}
+    assert scale == fixed | {"last_action": 1.0, "past_actions": 1.0, "palm_gravity": 1.0}
+
+
 def test_ablations_show_a_quaternion_and_an_unweighted_centre(hand, readings, truth):
     config = ObservationConfig(orientation="quaternion", weighting="none")
     shown = {"relative_orientation": truth["relative_quaternion"], "contact_centre": truth["plain_centre"]}

@@ -36,10 +36,10 @@ def by_field(layout, observation):
     return dict(zip((entry.name for entry in layout), jnp.split(observation, ends[:-1], axis=-1), strict=True))
 
 
-def ground_truth(env, object, physics, force):
+def ground_truth(env, object, physics, force, hand=SimpleNamespace(pad_thickness_delta=0.0)):  # noqa: B008
     """What a task would see of this object and physics state, under forces [F, 3] N on the finger tips."""
     zero = jnp.zeros(env.hand.num_joints)
-    episode = SimpleNamespace(object=object, hand=SimpleNamespace(pad_thickness_delta=0.0))
+    episode = SimpleNamespace(object=object, hand=hand)
     return env._ground_truth(episode, StepResult(physics, force), (zero, zero > 0), zero, zero)
 
 

@@ -1,11 +1,13 @@
 """Configuration: every refusal names the field, the value, its unit and its range; the round trip keeps all."""
 
 import dataclasses
+import importlib
 import json
 import math
 import typing
 
 import pytest
+from paths import ROOT
 
 from dexsim.core.config import Config, Range, from_dict, override, setting, to_dict
 from dexsim.core.errors import ConfigError
@@ -80,6 +82,16 @@ def test_a_config_survives_the_round_trip(fields):
     chair = Chair(seat=Spring(**fields), legs=3)
     again = from_dict(Chair, json.loads(json.dumps(to_dict(chair))))
     assert again == chair and hash(again) == hash(chair)  # usable as a static argument
+
+
+def test_no_configuration_takes_settings_by_position_or_changes():
+    """By position a number would become another setting with the next field; static arguments must not change."""
+    folders = "dexsim/env dexsim/tasks dexsim/touch dexsim_ppo/learner dexsim_real/control dexsim_real/sensors".split()
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")] + [ROOT / "dexsim/observation.py"]
+    for path in paths:
+        importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    for kind in [kind for kind in Config.__subclasses__() if kind.__module__.startswith("dexsim")]:
+        assert kind.__dataclass_params__.frozen and all(field.kw_only for field in dataclasses.fields(kind)), kind
 
 
 @pytest.mark.parametrize(

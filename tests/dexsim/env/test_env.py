@@ -1,5 +1,6 @@
 """The environment as a whole: pure steps, episodes, readings, touch. One compiled grasp for all."""
 
+import copy
 import dataclasses
 from types import SimpleNamespace
 
@@ -10,15 +11,17 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import skin_law
-from episodes import by_field, with_episode
+from episodes import by_field, ground_truth, with_episode
 from tiny_env import assert_same, leaves
 
 from dexsim import observation
 from dexsim.actuator.drive import delayed_target
+from dexsim.env.evaluation import take_snapshot
 from dexsim.env.motors import JointCommand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES
 from dexsim.physics.interface import PhysicsState
+from dexsim.touch.skin import Skin
 
 WORLDS = 8
 
@@ -200,8 +203,8 @@ class TestEpisodes:
         assert np.all(np.any(ours[".key"] != before[".key"], axis=-1))
         pool = {tuple(q) for q in np.asarray(grasp_env.pool.qpos)}
         assert all(tuple(q) in pool for q in ours[".physics.qpos"][done])
-        for name in ("tick", "length", "episode_return", "reward"):
-            assert not np.any(ours["." + name][done]), name
+        for name in (".tick", ".length", ".episode_return", ".reward", ".metrics['non_finite']"):
+            assert not np.any(ours[name][done]), name
         assert np.any(
             ours[".episode.hand.actuator.encoder_bias"][done] != before[".episode.hand.actuator.encoder_bias"][done]
         )
@@ -259,6 +262,21 @@ class TestEpisodes:
         np.testing.assert_allclose(np.array(heights[4:]) - heights[3], np.tile(fall[:, None], WORLDS), rtol=0.02)
 
 
+@pytest.mark.parametrize(("method", "margin"), [("surface_points", 0.003), ("closed_form", 0.001)])
+def test_the_contacts_springs_have_the_solvers_geometry_and_rubber_whatever_the_taxels_feel_by(
+    grasp_env, history, method, margin
+):
+    after, other = history[-1][2], copy.copy(grasp_env)
+    other.config = dataclasses.replace(grasp_env.config, touch_method=method, skin=Skin(margin=margin))
+    aside = 0.001 * (method != "closed_form")  # m, by which its geometry is off
+    other.touch_geometry = lambda object: dataclasses.replace(object.shape(), position=object.position + aside)
+    none = jnp.zeros((5, 3))
+    feel = jax.jit(jax.vmap(lambda s: ground_truth(other, s.episode.object, s.physics, none, s.episode.hand)))
+    found, own = feel(after), after.tip_stiffness
+    np.testing.assert_allclose(found.tip_stiffness, own, rtol=1e-4)
+    assert np.ptp(own) > 0.1 and np.any(found.touch.depth > 0)
+
+
 def test_a_world_that_blows_up(grasp_rollout, history):
     """It terminates, shows sober numbers, and the others never notice.
 
@@ -298,6 +316,16 @@ class TestReadings:
         observe = lambda r: observation.observe(hand, r, observation.GRASP, grasp_env.config.observation)  # noqa: E731
         seen = jax.jit(jax.vmap(observe))(after.readings)
         np.testing.assert_allclose(after.obs["actor"], seen, rtol=1e-5, atol=1e-5)
+        place = np.asarray(after.readings.object_position)
+        np.testing.assert_array_equal(place[:, 1:], np.tile(np.float32(hand.grasp_centre[1:]), (WORLDS, 1)))
+        assert np.ptp(place[:, 0]) > 0, "a camera measures the height alone"
+
+    def test_a_film_shows_the_truth_and_no_goal_orientation_of_a_grasp(self, grasp_env, history):
+        after = row(history[-1][2], 0)
+        shown = take_snapshot(grasp_env, after)
+        assert shown.goal_rotation is None and float(shown.seconds) == pytest.approx(12 * grasp_env.control_period)
+        place = np.concatenate([shown.joint_position, shown.object_position])
+        np.testing.assert_array_equal(place, after.physics.qpos[:15])
 
     def test_the_critic_sees_the_truth(self, hand, grasp_env, history):
         after = history[-1][2]

@@ -89,3 +89,13 @@ def test_no_start_is_trainings_and_none_repeats():
         assert len(np.unique(plan.row)) == len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
         seen.append(plan.start.qpos)
     assert len(np.unique(np.concatenate(seen), axis=0)) == 8 + 1 + 8 + 30 + 8
+
+
+@pytest.mark.parametrize(("count", "pools"), [(1, 1), (8, 2), (9, 3)])
+def test_a_plan_that_repeats_starts_ends_with_twice_as_many(count, pools):
+    """Where episodes are meant to share one; each pool takes minutes."""
+    task, made = Rows(), []
+    task.make_pool = lambda key: made.append(key) or Rows.make_pool(task, key)
+    task.evaluation_plan = lambda count, shape_index: (np.zeros(count, int), np.arange(count))
+    Evaluation(SimpleNamespace(name="rows", task=task)).evaluation_plan(count, 0)
+    assert len(made) == pools

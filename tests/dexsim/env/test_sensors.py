@@ -51,7 +51,7 @@ def read(hand):
             tilt=jnp.array([0.1, 0.0]),
         )
         imu = ImuParams(**{f.name: zero for f in dataclasses.fields(ImuParams)})
-        imu = dataclasses.replace(imu, bias=bias)
+        imu = dataclasses.replace(imu, bias=bias, drift=jnp.float32(0.5))
         episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.taxels.sample(jax.random.key(0), 0.0))
         readings, then = last or (None, now)
         before = SimpleNamespace(readings=readings, length=jnp.int32(3), taxel_memory=suite.taxels.init())
@@ -82,6 +82,9 @@ def test_readings_are_a_quarter_tick_old_and_have_the_hands_own_errors(hand, rea
     np.testing.assert_allclose(found.joint_torque, 1.5 * 0.25, rtol=1e-5)
     assert float(found.command) == 0.25 and np.all(np.asarray(found.last_action) == 0.5)
     np.testing.assert_array_equal(found.goal_quat, GOAL[1])
+    # The heading drifts about the vertical, which is -x for a palm that faces down; the fourth tick.
+    turn = Rotation.from_quat(found.object_quat, scalar_first=True).as_rotvec()
+    np.testing.assert_allclose(turn, [-0.5 * 4 * GraspConfig().physics.control_period, 0.0, 0.0], atol=1e-5)
 
 
 def test_only_the_measured_coordinates_move_and_their_velocity_is_filtered(hand, read):

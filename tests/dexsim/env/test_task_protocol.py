@@ -7,17 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from episodes import ones_of, with_episode
+from shapes import solid
 from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim import registry
 from dexsim.core.compilation import jit
 from dexsim.core.config import setting
+from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
+from dexsim.env.env import touch_geometry
 from dexsim.env.state import Start
 from dexsim.env.task import reward_of
+from dexsim.geometry import grid, surface_points
+from dexsim.geometry.distance import signed_distance
+from dexsim.geometry.mesh import load_mesh
+from dexsim.objects.params import ObjectParams
 
 WORLDS = 4
 
@@ -111,9 +119,31 @@ def test_it_runs_from_reset_to_restart(env):
     jax.tree.map(lambda new, old: (new.shape, new.dtype) == (old.shape, old.dtype) or pytest.fail(), again, state)
 
 
+def test_taxels_feel_a_mesh_at_the_size_of_the_episode(monkeypatch):
+    """1 mm beside each face of a cuboid that is 1.2 times as large as its file; primitives as they are."""
+    half = np.float32([0.025, 0.018, 0.032])
+    cuboid = SimpleNamespace(mesh=load_mesh(trimesh.creation.box(2 * half)), boxes=SimpleNamespace(size=half[None]))
+    monkeypatch.setattr("dexsim.env.env.load_mesh_object", lambda config: cuboid)
+    monkeypatch.setitem(grid.bake.__kwdefaults__, "nodes", 32)
+    points = jnp.asarray(np.concatenate([sign * np.diag(1.2 * half + 0.001) for sign in (1, -1)]), jnp.float32)
+    for method in ("grid", "surface_points"):
+        geometry = touch_geometry(SimpleNamespace(mesh="cuboid.stl"), method)(SimpleNamespace(size=1.2 * half[None]))
+        np.testing.assert_allclose(jax.jit(signed_distance)(points, geometry), 0.001, atol=2e-4)
+    primitives, shape = SimpleNamespace(mesh=""), solid("box", *half)
+    assert touch_geometry(primitives, "closed_form") is ObjectParams.shape
+    found = touch_geometry(primitives, "surface_points")(SimpleNamespace(shape=lambda: shape))
+    np.testing.assert_array_equal(found.position, surface_points.from_shape(shape).position)
+    with pytest.raises(ConfigError, match="touch_method = 'grid': needs ObjectConfig.mesh"):
+        touch_geometry(primitives, "grid")
+
+
 @pytest.mark.parametrize("reward", [True, np.float64(1.0), jnp.float16(1.0)])
 def test_a_reward_may_be_any_number(reward):
     """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
     task = SimpleNamespace(name="balance", reward=lambda *_: (reward, {}))
     found, _ = reward_of(task, None, None, jnp.zeros((), bool))
     assert (found.shape, found.dtype, float(found)) == ((), jnp.float32, 1.0)
+    for name, given in (("reward", (jnp.ones(3), {})), ("speed", (reward, {"speed": jnp.ones(2)}))):
+        task.reward = lambda *_, given=given: given
+        with pytest.raises(ConfigError, match=f"task 'balance': {name} must be a scalar; got shape"):
+            reward_of(task, None, None, jnp.zeros((), bool))

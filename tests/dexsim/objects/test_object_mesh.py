@@ -1,7 +1,6 @@
-"""Meshes as objects: the boxes that follow them, mass properties, errors, and environments with them."""
+"""Meshes as objects: the boxes that follow them, mass properties, errors, sizes drawn."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -9,31 +8,17 @@ import trimesh
 import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError
-from dexsim.geometry import distance, sdf
 from dexsim.geometry.mesh import load_mesh
 from dexsim.objects.config import KINDS, ObjectConfig
-from dexsim.objects.mesh import load, principal_axes
+from dexsim.objects.mesh import load
 from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig
-
-WORLDS = 4
-
-
-def ell():
-    """An L of 60 x 50 x 30 mm whose bars are 20 mm wide."""
-    outline = 0.01 * np.array([[0, 0], [6, 0], [6, 2], [2, 2], [2, 5], [0, 5]])
-    vertices = np.concatenate([np.c_[outline, np.full(6, z)] for z in (0, 0.03)])
-    caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
-    after = [(k + 1) % 6 for k in range(6)]
-    walls = [face for k in range(6) for face in ([k, after[k], after[k] + 6], [k, after[k] + 6, k + 6])]
-    return trimesh.Trimesh(vertices, np.concatenate([caps[:, ::-1], caps + 6, walls]), process=False)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("meshes")
     trimesh.creation.box((50, 36, 64)).export(path / "cuboid.ply")  # millimetres
-    ell().export(path / "ell.obj")
     return path
 
 
@@ -45,17 +30,6 @@ def test_a_cuboid_gives_back_a_cuboid(folder):
     np.testing.assert_allclose(np.abs(mesh_object.boxes.quat), [[1, 0, 0, 0]], atol=1e-4)
     square = np.array([0.05, 0.036, 0.064]) ** 2
     np.testing.assert_allclose(mesh_object.inertia, (square.sum() - square) / 12, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_an_l_is_two_bars(folder):
-    """In the object's frame, which lies askew to them."""
-    mesh_object, solid = load(str(folder / "ell.obj"), unit=1.0, parts=6), ell()
-    axes = principal_axes(solid.moment_inertia / solid.mass)
-    assert len(mesh_object.boxes.size) == 2 and 0.3 < np.arccos(axes[0, 0]) < 0.8
-    corners = (np.asarray(solid.vertices) - solid.center_mass) @ axes
-    on_surface = np.abs(sdf.signed_distance(jnp.float32(corners), mesh_object.boxes.shape()))
-    assert on_surface.max() < 3e-4 and max(mesh_object.boxes.deviation) < 3e-4
 
 
 def test_loose_vertices_are_no_part_of_a_mesh():
@@ -95,20 +69,3 @@ def test_sizes_masses_and_inertia_drawn_are_of_the_solid(folder):
     solid = np.asarray(drawn.mass)[:, None] / 12 * (np.sum(sides**2, 1, keepdims=True) - sides**2)
     np.testing.assert_allclose(drawn.inertia, solid, rtol=1e-4)
     assert np.all(drawn.shape_index == KINDS.index("mesh")) and np.ptp(drawn.mass) > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
-def test_taxels_feel_the_mesh_at_the_size_of_the_episode(folder, method):
-    objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
-    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="c")
-    targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.object)
-    assert len(np.unique(env.pool.object.size[:, 0, 0])) == 16
-    points = jnp.asarray(np.random.default_rng(0).uniform(-0.035, 0.035, (500, 3)), jnp.float32)
-    felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env.touch_geometry(target))))(targets)
-    exact = jax.vmap(lambda target: sdf.box(points, target.size[0]))(targets)
-    near = np.abs(exact) < 0.003
-    # Surface points: beyond an edge the offset from a face's plane falls short of the distance.
-    mean, worst = {"closed_form": (1e-6, 1e-6), "grid": (3e-5, 3e-4), "surface_points": (3e-4, 5e-3)}[method]
-    error = np.abs(felt - exact)[near]
-    assert error.mean() < mean and error.max() < worst

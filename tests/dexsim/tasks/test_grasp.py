@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from episodes import still_moment
+from scipy.spatial.transform import Rotation
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics
@@ -18,7 +19,7 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import COMMANDS, Grasp, GraspGoal, command_reward
-from dexsim.tasks.shared import clearance
+from dexsim.tasks.shared import clearance, palm_height
 from dexsim.touch.taxel_force import Touch
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
@@ -215,10 +216,33 @@ class TestPool:
         assert low - 1e-5 <= gap.min() and gap.max() <= high + 1e-5
         assert np.ptp(gap) > 0.7 * (high - low)
 
+    def test_long_objects_lie_across_the_fingers_either_way_askew_and_turned(self, grasp_env):
+        pool = grasp_env.pool
+        axis = Rotation.from_quat(pool.qpos[:, 15:19], scalar_first=True).apply([0.0, 0.0, 1.0])
+        assert np.abs(axis[:, 1]).min() > math.cos(0.6) * math.cos(0.3) and 0.3 < np.mean(axis[:, 1] > 0) < 0.7
+        askew, turn = np.arcsin(axis[:, 0]), np.arctan2(axis[:, 2], np.abs(axis[:, 1]))
+        for angle, most in ((askew, 0.3), (turn, 0.6)):
+            assert angle.min() < -0.8 * most and angle.max() > 0.8 * most
+
+    def test_a_hand_without_a_grasp_is_refused(self, hand):
+        for missing in ("grasp_posture", "grasp_centre"):
+            bare = dataclasses.replace(hand, name="bare", **{missing: ()})
+            with pytest.raises(ConfigError, match=r"'bare' has no grasp: its TOML needs \[grasp\] with posture"):
+                Grasp(GraspConfig(), bare)
+
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))
         with pytest.raises(ConfigError, match="0 of 5 start states of shape 'box'"):
             Grasp(GraspConfig(pool_size=5, objects=wide), hand).make_pool(jax.random.key(0))
+
+
+def test_the_face_of_a_palm_is_the_farthest_of_its_own_boxes_that_touch(hand):
+    box = next(g for g in hand.geoms if g.kind == "box" and g.body == hand.body_names.index(hand.palm))
+    turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    mine = dataclasses.replace(box, position=np.array([0.01, 0, 0]), size=np.array([0.01, 0.02, 0.03]), rotation=turn)
+    others = {"body": hand.tip_body[1]}, {"touches": False}
+    far = [dataclasses.replace(mine, position=np.array([1.0, 0, 0]), **other) for other in others]
+    assert palm_height(dataclasses.replace(hand, geoms=(mine, *far))) == pytest.approx(0.01 + 0.02)
 
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])

@@ -85,6 +85,9 @@ class TestSummary:
             assert row["total_force_n"]["mean"] == pytest.approx(3 * target)
             assert row["target_force_n"] == pytest.approx(target)
             assert row["touching_fingers"]["mean"] == pytest.approx(3.0)
+        assert [row["saturates"] for row in found["by_command"]] == [False] * 4 + [True]
+        assert found["slope_force_n"]["mean"] == pytest.approx(4.0)
+        assert found["slope_torque"]["mean"] == pytest.approx(0.8)
         for row in found["by_shape"] + found["by_command"]:
             assert row["episodes"] == 40 and row["held"]["mean"] == 0.75
 

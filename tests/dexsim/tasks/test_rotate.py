@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from episodes import still_moment
+from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 from shapes import integrate
 
@@ -84,9 +85,10 @@ class TestGoal:
         assert of_hand.reference == of_hand.config.reference == hand.rotate_reference == (0.047, 0.024, 0.088)
         assert of_hand.config.posture == hand.rotate_posture
         assert given.config == clear_of_palm() and given.reference == (0.072, 0.005, 0.098)
-        bare = dataclasses.replace(hand, name="bare", rotate_posture=(), rotate_reference=())
-        with pytest.raises(ConfigError, match=r"^hand 'bare' has no rotate: .*\[rotate\] with posture and reference$"):
-            Rotate(RotateConfig(), bare)
+        for missing in ("rotate_posture", "rotate_reference"):
+            bare = dataclasses.replace(hand, name="bare", **{missing: ()})
+            with pytest.raises(ConfigError, match=r"'bare' has no rotate: .*\[rotate\] with posture and reference$"):
+                Rotate(RotateConfig(), bare)
         with pytest.raises(ConfigError, match="12 posture angles, the hand has 6"):
             dexsim.make("rotate_clear", hand=dexsim.load_hand("inspire_like"), backend="c")
         with pytest.raises(ConfigError, match="expected 3 numbers"):
@@ -372,6 +374,14 @@ class TestPool:
         # On the palm, which gives way where a finger presses from above.
         assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.6
         assert np.ptp(pool.object.friction) > 0.3
+        # All but the last quarter stand level, turned either way and near the reference; those are stuck in the trap.
+        place, free = pool.qpos[:, 12:15] - task.reference, np.arange(24) < 18
+        pitch, heading = np.arctan2(-turns[:, 2, 0], turns[:, 0, 0]), np.arctan2(turns[:, 2, 1], turns[:, 1, 1])
+        assert np.all(turns[free, 0, 0] > np.cos(0.35)) and np.abs(heading[free]).max() <= 0.75
+        assert heading[free].min() < -0.4 and heading[free].max() > 0.4
+        assert np.all(np.linalg.norm(place[free], axis=1) < 0.6 * config.turn.distance)
+        assert np.all((pitch[~free] > 0.35) & (pitch[~free] < 0.9) & (place[~free, 2] > 0.017))
+        assert np.all(np.linalg.norm(place[~free], axis=1) < config.drop_radius)
         # Each size has its share, though large cubes fit between the fingers in far fewer postures.
         assert np.all(np.histogram(2 * half, 3, config.edge)[0] > 4)
         monkeypatch.setattr(start, "_make", None)  # It is in the cache.
@@ -384,6 +394,42 @@ class TestPool:
             Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]), np.asarray(axis) / np.linalg.norm(axis), atol=1e-6
         )
         assert upright(TurnSpec(axis=(0.5, 0.0, 0.0)).unit_axis) is None
+
+    def test_a_cube_for_a_tilted_axis_stands_on_it_from_the_start(self):
+        config = clear_of_palm()
+        np.testing.assert_allclose(draw_object(jax.random.key(0), config).quat, [upright(config.turn.unit_axis)])
+        assert draw_object(jax.random.key(0), RotateConfig()).quat is None
+
+    def test_objects_settle_with_their_own_properties_and_what_diverges_is_no_start(self, hand, monkeypatch):
+        monkeypatch.setattr(start, "_stays", lambda config, place, *_: np.ones(len(place), bool))
+        task, rows = Rotate(any_object(), hand), np.array([0, 2, 5, 6])
+        config, scene = task.config, start._scene(hand, task.config, task.gravity)
+        draw = jax.jit(jax.vmap(lambda key: start._candidate(key, sample_turned_object(key, config), hand, config)))
+        candidates = jax.device_get(draw(jax.random.split(jax.random.key(1), 8)))
+        candidates["qpos"] = np.where(np.arange(8)[:, None] == 5, np.nan, candidates["qpos"])
+        batch = Batch(scene.model, 8, 1)
+        assert start._settle(batch, scene, config, candidates, rows, False)[0].tolist() == [0, 2, 6]
+        object, body, pairs, model = candidates["object"], scene.object_body, scene.object_pairs, scene.model
+        for name, at, value in (
+            ("geom_size", scene.object_geoms, object.size),
+            ("geom_quat", scene.object_geoms, object.quat),
+            ("body_mass", body, object.mass),
+            ("body_inertia", body, object.inertia),
+            ("body_ipos", body, object.com),
+        ):
+            np.testing.assert_allclose(batch.expand(name)[rows][:, at], value[rows], rtol=1e-5, err_msg=name)
+        ends = model.geom_bodyid[np.stack([model.pair_geom1[pairs], model.pair_geom2[pairs]])]
+        tips = np.isin(ends, scene.tip_bodies).any(0)
+        slide = np.where(tips, object.friction[:, None], object.link_friction[:, None])
+        np.testing.assert_allclose(batch.expand("pair_friction")[rows][:, pairs, 0], slide[rows], rtol=1e-5)
+
+    def test_objects_that_fingers_hold_begin_clear_of_the_palm(self, hand):
+        cube = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), draw_object(jax.random.key(0), RotateConfig()))
+        qpos = np.zeros((3, 19), np.float32)
+        qpos[:, 15], qpos[:, 12] = 1.0, palm_height(hand) + cube.size[:, 0, 0] + np.array([0.0005, 0.0015, 0.02])
+        rows = np.arange(3)
+        for support, clear in (("fingers", [1, 2]), ("palm", [0, 1, 2])):
+            assert start._clear_of_palm(hand, RotateConfig(support=support), cube, rows, qpos).tolist() == clear
 
     def test_another_start_is_another_pool(self, hand):
         key, config = jax.random.key(0), RotateConfig()

@@ -184,6 +184,17 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     np.testing.assert_allclose(exact, numeric, rtol=0.03, atol=0.03 * np.abs(numeric).max())
 
 
+@pytest.mark.parametrize("most", [0.2, 0.5, 0.8])
+def test_a_skin_that_softens_within_its_compression_is_refused(most):
+    """A negative C01 of just what its stress still grows with, and of just more than that; by differences."""
+    stretch = np.linspace(1 - most, 1, 2000)
+    growth = lambda c01: np.diff(2 * (stretch**-2 - stretch) * (1e4 + c01 / stretch))  # noqa: E731
+    limit = max(c01 for c01 in np.arange(-9990.0, 0.0, 10.0) if np.any(growth(c01) >= 0))
+    Skin(c10=1e4, c01=limit + 60, max_compression=most)
+    with pytest.raises(ConfigError, match="no positive stiffness at the max_compression of"):
+        Skin(c10=1e4, c01=limit - 60, max_compression=most)
+
+
 @pytest.mark.parametrize("name", MATERIALS)
 def test_named_materials_stiffen(name):
     skin = skin_of(name, max_compression=0.9, thickness=0.002)

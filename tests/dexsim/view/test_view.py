@@ -1,9 +1,6 @@
-"""The live view: what it draws, what its controls change, the page's buttons, and the page in a real browser."""
+"""The live view: what it draws, what its controls change, the recorded episodes, the page's buttons."""
 
 import dataclasses
-import io
-import itertools
-import shutil
 import subprocess
 import sys
 import threading
@@ -121,22 +118,6 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     assert min(seconds[first + 20 : first + 45]) < 0.1, "a new episode begins"
 
 
-@pytest.mark.slow
-def test_the_emulated_hand_is_a_source(hand, monkeypatch):
-    # The flags that other tests compile with stay as they are.
-    monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
-    source, gui = open_source(ViewArguments(what="rotate", emulated=True)), Gui()
-    source.add_controls(gui)
-    assert not gui
-    frames = list(itertools.islice(source.episode(), 31))
-    snapshot = frames[-1].snapshot
-    assert frames[0].kinds == ("box",) and frames[-1].note == "trial 0" and snapshot.turns >= 0
-    assert np.linalg.norm(snapshot.object_position - [0.047, 0.024, 0.088]) < 0.05
-    moved = np.ptp([frame.snapshot.joint_position for frame in frames], 0)
-    assert moved.max() > 0.1 and np.all(snapshot.joint_position > hand.joint_lower - 0.1)
-    assert next(source.episode()).note == "trial 1"
-
-
 # Everything that the base install leaves out is absent.
 WITHOUT_JAX = """
 import sys
@@ -186,32 +167,6 @@ def test_poses_for_pictures_are_those_of_the_kinematics(hand):
 # --- the page -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def page(simulation):
-    """The page in a headless Chromium, its viewer running beside it."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no Chromium on this machine (apt-get install chromium)")
-    pytest.importorskip("viser")
-    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
-
-    viewer, stop = Viewer(simulation, title="test", port=18080), threading.Event()
-    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
-    running.start()
-    with sync_playwright() as playwright:
-        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=chromium, args=software)
-        opened = browser.new_page(viewport={"width": 900, "height": 600})
-        opened.goto(viewer.url)
-        opened.wait_for_selector("canvas")
-        opened.viewer = viewer
-        yield opened
-        browser.close()
-    stop.set()
-    running.join(10)
-    assert not running.is_alive()
-
-
 def wait_until(condition, seconds=25.0):
     end = time.monotonic() + seconds
     while not (met := condition()) and time.monotonic() < end:
@@ -242,18 +197,3 @@ def test_the_page_runs_pauses_steps_and_begins_anew():
         stop.set()
         running.join(10)
     assert not running.is_alive()
-
-
-@pytest.mark.slow
-def test_the_page_shows_the_hand(page):
-    from PIL import Image
-
-    def colors():
-        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[100:, :450]
-        return len(np.unique(picture.reshape(-1, 3), axis=0))
-
-    assert wait_until(lambda: colors() > 200), "the canvas stays empty"
-    page.viewer.paused.value = True
-    time.sleep(0.5)
-    page.get_by_role("button", name="reset").click()
-    assert wait_until(lambda: float(page.viewer.source._state.length) == 0)

@@ -80,6 +80,11 @@ def test_restart_is_a_new_episode_where_asked():
     assert restart(same, jnp.bool_(True)).inner["x"] != fresh.inner["x"], "keys advance either way"
 
 
+def test_a_report_has_the_means_of_its_own_metrics_over_the_steps_that_episodes_lived():
+    metrics = {"distance": np.array([[1.0, 3.0], [5.0, 99.0]]), "return": np.ones((2, 2)), "length": np.ones((2, 2))}
+    assert ENV.summarize(metrics, np.array([[True, True], [True, False]])) == {"headline": {"distance": 3.0}}
+
+
 def test_complete_environments_are_left_alone():
     """That `make_train` adapts is shown by `docs/any_environment.md`, whose example runs."""
     assert adapt(ENV, "other") is ENV and adapt(Reach()).name == "Reach"

@@ -96,12 +96,12 @@ def experience(script, config, params, stats, value_stats, key):
         )
         normalizers = ppo.make_normalizers(script, config, stats)
         _, rollout, _ = ppo.collect_rollout(script, config, state)
-        samples, state, _ = ppo.prepare(config, state, rollout)
+        samples, state, explained = ppo.prepare(config, state, rollout)
         start = state.params
         moved = jax.tree.map(jnp.add, start, step)
         objective = lambda p: loss(p, config, normalizers, samples, params.log_std)  # noqa: E731
         (value, metrics), grads = jax.value_and_grad(objective, has_aux=True)(moved)
-        return rollout.decision.action, start, value, grads, metrics["kl"]
+        return rollout.decision.action, start, value, grads, metrics["kl"], explained
 
     return run
 
@@ -195,11 +195,13 @@ def test_objective_and_gradient_from_raw_experience(options):
     run = experience(script, config, params, stats, value_stats, jax.random.key(5))
     rng = np.random.default_rng(0)
     for share in (0.0, 1.0):
-        actions, start, value, grads, kl = run(jax.tree.map(lambda x, share=share: share * x, step))
+        actions, start, value, grads, kl, explained = run(jax.tree.map(lambda x, share=share: share * x, step))
         reference = Reference(script, config, params, stats, value_stats, actions)
         here = jax.tree.map(lambda a, b, share=share: a + share * b, double(start), double(step))
         assert float(value) == pytest.approx(reference(here), rel=2e-5, abs=2e-5)
         assert float(kl) == pytest.approx(reference.divergence(here), rel=1e-4, abs=1e-6)
+    unexplained = np.var(reference.target - reference.value) / np.var(reference.target)
+    assert float(explained) == pytest.approx(1 - unexplained, abs=1e-4)
     assert abs(reference.new_std / reference.std - 1) > 0.1
     after = reference.new_mean + reference.new_std * reference.critic(double(start), reference.obs["critic"])
     np.testing.assert_allclose(after, reference.value, atol=1e-4)

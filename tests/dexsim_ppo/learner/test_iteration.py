@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner import running_stats, update
+from dexsim_ppo.learner import distribution, running_stats, update
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.loss import Samples
@@ -81,6 +82,11 @@ def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
     assert float(metrics["kl"]) == 1.0 and float(metrics["value_loss"]) == 2.0
     assert float(after.learning_rate) == pytest.approx(RATE / 1.5)
     assert int(after.adam.count) == config.epochs * (config.minibatches - 1)
+    # The target halves with the iterations that were learnt from: 2.2 at first, 1.1 after a hundred.
+    config, count = dataclasses.replace(UPDATES, kl_target=2.2, kl_halving=100), 99 * config.epochs * config.minibatches
+    late = learner._replace(adam=dataclasses.replace(learner.adam, count=jnp.int32(count)))
+    after, _ = update.update(config, {}, numbered(1), jax.random.key(1), late)
+    assert float(after.learning_rate) == pytest.approx(RATE)
 
 
 @pytest.mark.parametrize("part", ["actor", "log_std", "critic"])
@@ -189,10 +195,18 @@ def test_rewards_beyond_a_hundred_deviations_of_returns_are_bounded_and_others_s
     stats = RunningStats(jnp.int32(9), jnp.float32(0), jnp.float32(25))
     reward = jax.random.normal(jax.random.key(1), (16, 64)).at[1, 2].set(450.0).at[2, 3].set(-1500.0)
     zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
-    bounded, count = jax.jit(bound_rewards)(Rollout({}, None, zero, zero, reward, flag, flag), stats)
+    bound = jax.jit(bound_rewards)
+    bounded, count = bound(Rollout({}, None, zero, zero, reward, flag, flag), stats)
     assert float(count) == 1
     np.testing.assert_allclose(bounded.reward[2, 3], -500.0, rtol=1e-5)
     np.testing.assert_array_equal(bounded.reward, reward.at[2, 3].set(bounded.reward[2, 3]))
+    # While there are no returns: a thousand times the root mean square of the others; a first reward may be alone.
+    calm = jnp.where(jnp.abs(reward) < 10, reward, 0.0)
+    limit, alone = 1000 * jnp.sqrt(jnp.mean(calm**2)), zero.at[1, 2].set(900.0)
+    for given, expected in ((calm.at[1, 2].set(-1e5), calm.at[1, 2].set(-limit)), (alone, alone)):
+        bounded, count = bound(Rollout({}, None, zero, zero, given, flag, flag), init_stats(()))
+        np.testing.assert_allclose(bounded.reward, expected, rtol=1e-4)
+        assert float(count) == (given is not alone)
 
 
 # --- formulas; `test_composed_objective.py` has the others ------------------------------------------------
@@ -208,8 +222,10 @@ def test_memory_fades_over_a_full_count():
 
 
 def test_statistics_of_a_column_that_is_not_finite_stay_unchanged():
-    stats = merge_moments(init_stats((2,)), jnp.array([2.0, jnp.nan]), jnp.array([1.0, jnp.nan]), 2)
-    np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0], [1.0, 1.0]])
+    """Mean, variance, or both."""
+    new = jnp.array([[2.0, jnp.nan, 2.0, jnp.inf], [3.0, jnp.nan, jnp.inf, 3.0]])
+    stats = merge_moments(init_stats((4,)), *new, 2)
+    np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0, 0.0, 0.0], [3.0, 1.0, 1.0, 1.0]])
 
 
 def test_hidden_kernels_are_orthogonal_of_gain_sqrt_2():
@@ -227,6 +243,18 @@ def test_adam_against_numpy():
         mean, square = 0.9 * mean + 0.1 * grad, 0.999 * square + 0.001 * grad**2
         parameters = parameters - 0.01 * (mean / (1 - 0.9**t)) / (np.sqrt(square / (1 - 0.999**t)) + 1e-5)
     np.testing.assert_allclose(got, parameters, rtol=1e-5, atol=1e-6)
+
+
+def test_densities_and_divergences_are_over_the_last_axis_alone():
+    """With a GRU there are two axes before it."""
+    rng = np.random.default_rng(0)
+    x, mean, other, std, other_std = *rng.normal(size=(3, 2, 4, 3)), *rng.uniform(0.5, 2, (2, 3))
+    near = functools.partial(np.testing.assert_allclose, rtol=1e-5)
+    x, mean, other, one, two = jax.tree.map(jnp.float32, (2 * x, 2 * mean, other, np.log(std), np.log(other_std)))
+    near(distribution.log_prob(x, mean, one), scipy.stats.norm.logpdf(x, mean, std).sum(-1))
+    near(distribution.bounds_loss(mean), (np.maximum(np.abs(mean) - 1.1, 0) ** 2).sum(-1))
+    terms = np.log(other_std / std) + (std**2 + np.asarray(mean - other) ** 2) / (2 * other_std**2) - 0.5
+    near(distribution.kl_divergence(mean, one, other, two), terms.sum(-1))
 
 
 def test_learning_rate_adapts_within_its_band():

@@ -124,6 +124,8 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
     reward, error = (np.where(np.isfinite(x), x, 0.0) for x in (reward, error))
     assert over.sum() > 3 and broken.sum() > 3, "the test tests less than it says"
     assert float(metrics["episodes"]) == over.sum() and float(metrics["nonfinite_rewards"]) == broken.sum()
+    ends = np.asarray(rollout.terminated).sum() / over.sum()
+    assert 0 < ends < 1 and float(metrics["terminated_share"]) == pytest.approx(ends)
     np.testing.assert_allclose(metrics["step/error"], error.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["episode/length"], length[over].mean(), rtol=1e-5)
     np.testing.assert_allclose(metrics["reward"], reward.mean(), rtol=1e-4)

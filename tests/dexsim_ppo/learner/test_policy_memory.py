@@ -13,6 +13,7 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import actor_mean
+from dexsim_ppo.learner.networks import GRU, Layer, step_memory
 from dexsim_ppo.policy import Policy
 
 MAX_STEPS = 6
@@ -92,12 +93,31 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
 
 
 def test_every_episode_begins_with_an_empty_memory_and_only_then():
-    (_, last), rollout, _ = experience("gru")
+    (_, last), rollout, samples = experience("gru")
     ended = rollout.terminated | rollout.truncated
     later = np.concatenate([rollout.carry[1:], last[None]])
     assert 0 < ended.sum() < ended.size and ended[:-1].any(), "episodes that end within the rollout"
     assert not later[ended].any()
     assert np.abs(later[~ended]).max(-1).min() > 0
+    env, config, _, state = learner("gru")
+    seen = jax.tree.map(jnp.asarray, dataclasses.replace(samples, first=samples.first > 0))
+    mean = actor_mean(config, state.params, ppo.make_normalizers(env, config, state.observation_stats), seen)
+    np.testing.assert_allclose(mean, samples.decision.mean, atol=1e-6, err_msg="the update replays what was done")
+    assert samples.first.any()
+
+
+def test_a_step_is_that_of_cudnns_unit():
+    """Gates in the order reset, update, candidate; the reset gate acts after the product. Also as a policy's file."""
+    rng, (inputs, units) = np.random.default_rng(0), (3, 4)
+    layers = [Layer(*(rng.normal(size=size) for size in ((n, 3 * units), 3 * units))) for n in (inputs, units)]
+    x, past = rng.normal(size=(5, inputs)), rng.normal(size=(5, units))
+    now, before = (np.split(a @ layer.kernel + layer.bias, 3, -1) for a, layer in zip((x, past), layers, strict=True))
+    reset, update = (1 / (1 + np.exp(-now[k] - before[k])) for k in (0, 1))
+    expected = (1 - update) * np.tanh(now[2] + reset * before[2]) + update * past
+    unit, x, past = jax.tree.map(jnp.float32, (GRU(*layers), x, past))
+    carry, features = step_memory(unit, past, x)
+    np.testing.assert_allclose(carry, expected, atol=1e-5)
+    np.testing.assert_allclose(features, np.concatenate([x, expected], -1), atol=1e-5)
 
 
 def test_gradients_go_back_through_the_rollout():

@@ -68,6 +68,9 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         return sensors.observe(readings, truth, task.goal_readings(goal))["actor"]
 
     goal = task.begin(jax.random.key(0), None)
+    compiled = lambda: [function._cache_size() for function in (controller._observe, controller._move)]  # noqa: E731
+    controller.warm()
+    assert compiled() == [1, 1], "the first tick must not wait for a compiler"
     for _ in range(20):
         quats = rng.normal(size=(2, 4))
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -78,6 +81,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         assert simulated.dtype == tick.observation.dtype == np.float32
         assert simulated.tobytes() == tick.observation.tobytes()
         assert len(simulated) == (66 if task.name == "grasp" else 92)
+    assert compiled() == [1, 1]
 
 
 def test_an_action_that_is_not_finite_counts_as_none(hand):

@@ -84,7 +84,7 @@ def ready(hand, **options):
 
 
 def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
-    bench = Bench(hand)
+    bench = Bench(hand, ramp=2.0)
     bench.position = MIDDLE - np.float32(0.3) * FREE
     assert bench.cycle(fresh=False).mode == bench.cycle(target=MIDDLE).mode == Mode.PASSIVE, "not engaged"
     bench.engage()
@@ -94,9 +94,9 @@ def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
     np.testing.assert_allclose(first.position, bench.position, atol=2e-7)
     path = np.array([first.position] + [d.position for d in bench.run(2.0, target=MIDDLE + np.float32(0.15))])
     speed = np.abs(np.diff(path, axis=0)).max(1) / CYCLE
-    # Nothing moves while the motors stiffen; then slow_speed (0.5) grows to speed (8) within ramp (1 s).
+    # Nothing moves while the motors stiffen; then slow_speed (0.5) grows to speed (8) within ramp (2 s).
     time = CYCLE + CYCLE * np.arange(len(speed))
-    assert np.all(speed <= (time >= SOFT) * (0.5 + 7.5 * np.clip(time - SOFT, 0.0, 1.0) + 1e-3))
+    assert np.all(speed <= (time >= SOFT) * (0.5 + 7.5 * np.clip((time - SOFT) / 2, 0.0, 1.0) + 1e-3))
     np.testing.assert_allclose(path[-1], MIDDLE + 0.15, atol=1e-6)
 
 

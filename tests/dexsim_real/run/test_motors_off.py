@@ -135,6 +135,30 @@ def test_the_guard_waits_for_a_cable():
         assert guard._process.wait(10) == 0
 
 
+def test_the_guard_leaves_a_hand_alone_whose_motors_were_never_on():
+    near, far = os.pipe()
+    os.close(far)
+    assert guard._watch(near, os.open(os.devnull, os.O_WRONLY)) == ""
+
+
+def test_only_the_runner_that_started_the_guard_is_killed(monkeypatch):
+    """Once it has ended, its number may be another's. The guard waits until the kernel has closed its files."""
+    for others in (True, False):
+        with subprocess.Popen(["sleep", "60"], stdout=subprocess.PIPE) as runner:
+            monkeypatch.setattr(guard, "_DEATH", 0.05 if others else 20.0)
+            monkeypatch.setattr(os, "getppid", lambda pid=runner.pid, others=others: pid + others)
+            guard._kill(runner.pid, runner.stdout.fileno())
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                runner.wait(0.2 if others else 20.0)
+            assert runner.returncode == (None if others else -signal.SIGKILL)
+            runner.kill()
+
+
+def test_the_guard_does_not_say_that_motors_are_off_which_it_cannot_reach(tmp_path, monkeypatch):
+    monkeypatch.setattr(guard, "_PATIENCE", 0.1)
+    assert guard._stop(str(tmp_path / "port"), QUICK, load_hand()) is False
+
+
 @pytest.mark.parametrize("wakes", [True, False])
 def test_a_machine_that_paused_gets_a_second_look(monkeypatch, wakes):
     """When all of it stood still, the runner's sign is overdue as the guard wakes, and comes a moment later."""
@@ -161,6 +185,7 @@ def test_a_suspended_guard_is_noticed_within_a_second(tmp_path, monkeypatch):
     watched = Guard(str(tmp_path / "port"), QUICK, load_hand())
     try:
         assert select.select([watched._output], [], [], 20)[0]
+        assert 1.5 <= watched._allowed < 3.0, "s for which a runner may stand still: longer than a slow hand's answers"
         watched.check()  # A node asks before its motors come on.
         watched.arm()
         for _ in range(20):

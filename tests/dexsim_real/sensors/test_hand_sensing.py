@@ -54,7 +54,7 @@ def test_taxels_are_tared_and_scaled(hand):
 
 def test_current_without_and_with_a_calibration(hand):
     counts = np.linspace(-900, 900, 12).astype(np.int16)
-    plain = HandSensing(hand, HardwareConfig(current_sign=-1.0, current_scale=1500.0))
+    plain = HandSensing(hand, HardwareConfig(current_scale=1500.0))  # A positive current opens.
     np.testing.assert_allclose(plain.measure(state(current=counts)).joint_torque, counts / -1500.0, atol=1e-6)
     np.testing.assert_allclose(plain.measure(state(current=counts)).current, np.abs(counts) / 1000.0, atol=1e-6)
 
@@ -210,6 +210,7 @@ def test_half_an_hour_of_warming_leaves_next_to_nothing(sensing, held, free):
 
 
 def test_a_zero_that_has_moved_far_is_told_once(sensing):
+    sensing.set_tare([state()])
     _, told = follow(sensing, [state(np.arange(120) < 35)] * 1200)
     assert len(told) == 5 and all("its zero has moved by 3" in line for line in told)
 

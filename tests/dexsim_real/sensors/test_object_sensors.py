@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import os
+import socket
+import sys
 import time
 import tty
 from types import SimpleNamespace
@@ -15,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from dexsim.task_spec import TaskSpec
 from dexsim_real.core.errors import HandError
 from dexsim_real.run import gravity_of
-from dexsim_real.sensors import imu
+from dexsim_real.sensors import camera as masks_of, imu
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, camera_axes, height_of
 from dexsim_real.sensors.imu import IDENTITY
 
@@ -79,6 +81,50 @@ def test_a_camera_that_ends_or_fails_says_so():
         sensor.close()
 
 
+def test_masks_of_another_program_arrive_whole_or_not_at_all(tmp_path):
+    """A picture, then one that is cut off, or what is no mask stream."""
+    mask = np.random.default_rng(0).random((7, 9)) < 0.5
+    wrong = b"MOSK" + masks_of.encode_mask(2.0, mask)[4:], masks_of._STREAM.pack(b"MASK", 65535, 65535, 2.0)
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(tmp_path / "masks"))
+    server.listen()
+    for last in (masks_of.encode_mask(2.0, mask)[:-1], masks_of.encode_mask(2.0, mask)[:9], *wrong):
+        read = masks_of.open_masks(f"unix:{tmp_path}/masks", CameraConfig())
+        link, _ = server.accept()
+        link.sendall(masks_of.encode_mask(1.5, mask) + last)
+        link.close()
+        when, found = read()
+        assert when == 1.5
+        np.testing.assert_array_equal(found, mask)
+        if last in wrong:
+            with pytest.raises(HandError, match="invalid mask frame"):
+                read()
+        else:
+            assert read() is None
+    server.close()
+    with pytest.raises(HandError, match="no program sends masks here"):
+        masks_of.open_masks(f"unix:{tmp_path}/nobody", CameraConfig())
+
+
+def test_a_camera_is_opened_by_its_number_or_file_and_segmented_by_a_function(monkeypatch):
+    opened, pictures = [], [(True, np.ones((2, 2, 3))), (False, None)]
+
+    def capture(spec):
+        opened.append(spec)
+        return SimpleNamespace(isOpened=lambda: spec != 9, read=lambda: pictures.pop(0))
+
+    monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(VideoCapture=capture))
+    before = time.monotonic()
+    read = masks_of.open_masks("numpy:sum", CameraConfig())
+    when, mask = read()
+    assert before <= when <= time.monotonic() and mask == 12 and read() is None
+    for spec in ("2", "/film:1.mp4", "rtsp://camera"):
+        masks_of.open_masks(spec, CameraConfig())
+    assert opened == [0, 2, "/film:1.mp4", "rtsp://camera"]
+    with pytest.raises(HandError, match="9: the camera cannot be opened"):
+        masks_of.open_masks("9", CameraConfig())
+
+
 @pytest.mark.parametrize("when", [1.7e9 * 10, math.nan])
 def test_a_picture_of_another_clock_does_not_stay_young(when):
     pictures = iter([(when, picture(REFERENCE, CameraConfig())), None])
@@ -104,9 +150,20 @@ def apart(a, b):
 def test_the_datasheets_example_message():
     # Yaw 0.01, pitch -1.10, roll 20.85 degrees.
     assert apart(imu.decode(DATASHEET)[1], quat_of(0.01, -1.10, 20.85)) < 1e-3
+    assert imu.encode(0xDE, quat_of(0.01, -1.10, 20.85), 9.80665e-3 * np.array([-371, -20, 977])) == DATASHEET
     bad = bytearray(DATASHEET)
     bad[7] ^= 1
     assert imu.decode(bytes(bad)) is None and imu.decode(DATASHEET[:-1]) is None
+    # Their checksums fit.
+    assert imu.decode(b"\xaa\xab" + DATASHEET[2:]) is None and imu.decode(DATASHEET[:-1] + b"\0\xe7") is None
+
+
+@pytest.mark.parametrize(("angle", "most"), [(0, 18000), (1, 9000), (2, 18000)])
+def test_an_angle_that_no_orientation_has_is_of_a_damaged_frame(angle, most):
+    """In 0.01 degree, at either end."""
+    for value, sound in ((most, True), (most + 1, False), (-most, True), (-most - 1, False)):
+        body = imu._BODY.pack(0, *[value * (k == angle) for k in range(3)], 0, 0, 0, 0, 0, 0)
+        assert (imu.decode(imu.HEAD + body + bytes([sum(body) & 0xFF])) is not None) == sound
 
 
 def turns(most):
@@ -118,6 +175,7 @@ def test_one_known_pose_aligns_all_three_angles(world, first, turn):
     """Whatever the palm's lean and the IMU's heading: a turn is measured as it is in the palm frame, and so is gravity.
     `world` turns the IMU's world, whose z is up, into the palm frame."""
     reader, mount = imu.ImuReader(), Rotation.from_quat(np.roll(imu.UPRIGHT_X, -1))
+    np.testing.assert_allclose(mount.apply([0.0, 0.0, 1.0]), [1.0, 0.0, 0.0], atol=1e-9)
     for index, pose in enumerate((first, turn * first)):
         reader.receive(0.01 * index, imu.encode(index, np.roll((world.inv() * pose * mount).as_quat(), 1)))
         if index == 0:
@@ -178,7 +236,7 @@ def test_a_fast_object_and_lost_frames_are_no_jump(speeds, lost, together):
         angle += 0.01 * speed
         if not (lost and lost <= tick < lost + 9):
             time = 0.01 * (tick - tick % together)
-            reader.receive(time, imu.encode(tick, quat_of(math.degrees(angle))))
+            reader.receive(time, imu.encode(tick + 245, quat_of(math.degrees(angle))))  # The index begins anew at 256.
         if tick == 0:
             reader.calibrate(IDENTITY)
             before = reader.read()[1]
@@ -214,13 +272,19 @@ def test_the_imu_thread_reads_a_port():
 
 def test_a_policy_waits_for_the_first_picture_and_not_for_a_camera_that_has_ended():
     camera = SimpleNamespace(newest=(-math.inf,), failure="")
-    objects = ObjectSensors(np.zeros(3), DOWN, camera)
+    objects, closed = ObjectSensors(np.zeros(3), DOWN, camera), []
     assert not objects.ready()
     camera.failure = "the camera sends no more pictures"
     with pytest.raises(HandError, match="no more pictures"):
         objects.ready()
     camera.newest = (0.0,)
     assert objects.ready() and ObjectSensors(np.zeros(3), DOWN).ready()
+    camera.read, camera.close = lambda: camera.newest, lambda: closed.append("camera")
+    assert objects.lost(0.29, 0.3) == "" and objects.lost(0.31, 0.3) == camera.failure
+    camera.failure = ""
+    assert objects.lost(0.31, 0.3) == "the object is out of sight"
+    objects.close()
+    assert closed == ["camera"]
 
 
 def test_without_sensors_the_object_is_where_it_should_lie_and_the_palm_leans_as_it_should():

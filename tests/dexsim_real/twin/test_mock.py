@@ -11,7 +11,6 @@ from untrained import untrained
 from dexsim import load_hand
 from dexsim_real import replay, run
 from dexsim_real.calibrate import __main__ as calibrate
-from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.mock import MockHand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
@@ -46,16 +45,6 @@ def test_a_policy_runs_and_its_log_is_replayed_to_the_last_bit(name, tmp_path, c
     assert summary["end"] == "time is over" and summary["motors_off"]
     assert replay.main([str(log), "--plot", str(tmp_path / "run.png")]) == 0
     assert "all observations agree to the last bit" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_joint_of_another_hand_is_identified(tmp_path):
-    """One that moves two hinges, by its angles alone."""
-    bench = bench_of("inspire_like")
-    options = arguments(tmp_path, identify=True, joints=("index",), output=tmp_path / "hand.json")
-    where = {"port": bench.port, "clock": bench.clock, "sleep": bench.sleep}
-    (result,) = identify_hand(options, bench.hand, operator(), **where)
-    assert result.joint == "index" and result.rmse < 0.02
 
 
 def test_presses_need_taxels_and_currents(tmp_path):

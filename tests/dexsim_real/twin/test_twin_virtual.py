@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from emulated_plant import free
 
-from dexsim.calibration.maps import normalised_torque
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.camera import CameraConfig
-from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import SHAPES
-from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, ideal_calibration, virtual_camera
+from dexsim_real.twin.virtual import RATE, VirtualPort, VirtualRun, virtual_camera
 from dexsim_real.twin.wire import picture
 
 OPTICS = CameraConfig()
@@ -74,10 +72,3 @@ def test_the_camera_measures_the_height(hand):
             assert picture(plant, OPTICS).sum() == pytest.approx(math.pi * radius**2, rel=0.03)
         # A composition's outline has another middle than the composition.
         assert position[0] == pytest.approx(reference[0] + 0.01, abs=0.001 if shape != "composition" else 0.006)
-
-
-def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
-    calibration = ideal_calibration(hand)
-    current = -0.5 * np.ones(12, np.float32)  # A, closing, half of what stalls
-    assert np.asarray(normalised_torque(calibration, current)) == pytest.approx(np.full(12, 0.5), abs=1e-6)
-    assert HardwareConfig().current_sign < 0

@@ -24,29 +24,6 @@ def ask(board, kind, data=b"", target=0x80):
     return board.answer(Frame(0xFE, target, kind, data))
 
 
-def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
-    plant = ScriptedPlant()
-    board = Firmware(plant)
-    ids = motors(REST)
-    ids["id"][4] = 9
-    broken = motors(REST)
-    broken["position"][2] = np.nan
-    for kind, data, number in (
-        (Command.EXCHANGE, ids.tobytes(), 1),
-        (Command.EXCHANGE, broken.tobytes(), 30),
-        (Command.EXCHANGE, motors(REST, mode=7).tobytes(), 67),
-        (Command.EXCHANGE, motors(REST, mode=5).tobytes(), 81),
-        (Command.READ_REGISTER, b"\x63\x00", 30),
-    ):
-        answer = ask(board, kind, data)
-        assert answer.command == Command.ERROR
-        assert int.from_bytes(answer.data, "little") == 1501000 + number
-    assert not board.motors["mode"].any() and plant.motors is None
-    # What is for another hand is no business of this one; a broadcast is.
-    assert ask(board, Command.VERSION, target=0x81) is None
-    assert ask(board, Command.VERSION, target=0xFF) is not None
-
-
 def test_the_state_in_the_wires_few_bits():
     rng = np.random.default_rng(0)
     angle, speed, current = rng.uniform(-0.7, 1.9, 12), rng.uniform(-20, 20, 12), rng.uniform(-900, 900, 12)

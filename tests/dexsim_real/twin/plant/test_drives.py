@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from emulated_plant import drives, motors
 
-from dexsim_real.twin.plant import drives as constants
 from dexsim_real.twin.plant.drives import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS
 from dexsim_real.wire.frames import Mode
 
@@ -80,20 +79,3 @@ def test_commands_reach_each_board_after_its_own_delay(hand):
         new = np.isnan(reached) & (torque > 0.1)
         reached[new] = k * PERIOD
     assert reached == pytest.approx(0.005 + np.ceil(made.delay / PERIOD - 1e-6) * PERIOD, abs=1e-9)
-
-
-def test_heat_settles_where_loss_and_flow_balance(hand, monkeypatch):
-    monkeypatch.setattr(constants, "WINDING", 0.01)
-    monkeypatch.setattr(constants, "CASE", 0.02)
-    made = drives(hand, thermal=1.0)
-    made.send(0.0, motors(0.1 * hand.torque_limit))
-    for k in range(4000):
-        made.step(k * PERIOD, np.zeros(12), np.zeros(12))
-    current = 0.3  # of 1 A: 0.1 rad per Nm of limit times 3 Nm/rad
-    assert made.current == pytest.approx(np.full(12, current))
-    loss = current**2 * constants.RESISTANCE * (1 + constants.RISE * (made.winding - constants.REFERENCE))
-    assert made.winding - made.case == pytest.approx(loss * constants.TO_CASE, rel=1e-3)
-    assert made.case - constants.AIR == pytest.approx(loss * constants.TO_AIR, rel=1e-3)
-    torque, _ = made.step(9.0, np.zeros(12), np.zeros(12))
-    weaker = 1 - constants.WEAKENING * (made.winding - constants.REFERENCE)
-    assert torque == pytest.approx(0.3 * hand.torque_limit * weaker, rel=1e-3)

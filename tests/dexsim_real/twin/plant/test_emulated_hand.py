@@ -4,15 +4,13 @@ import dataclasses
 import json
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from emulated_plant import free, motors, world
 
 from dexsim.randomization import tilted_down
-from dexsim_real.twin.plant import emulated_hand, scene
-from dexsim_real.twin.plant.drives import PERIOD
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, put, tilted
+from dexsim_real.twin.plant import scene
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand, Stage, tilted
 from dexsim_real.twin.plant.parameters import GRAVITY, TASKS, start_of
 from dexsim_real.twin.plant.shapes import matrix
 from dexsim_real.wire.frames import Mode
@@ -67,78 +65,6 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
 
 
-BALL = """<mujoco>
-  <option timestep="{}" gravity="0 0 -{}" cone="elliptic" integrator="implicitfast"/>
-  <default><geom contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <geom name="floor" type="box" size="1 1 .1" pos="0 0 -.1"/>
-    <body pos="0 0 .03"><freejoint/><geom name="ball" size=".03" mass=".1"/></body>
-  </worldbody>
-  <contact><pair geom1="floor" geom2="ball" condim="4"/></contact>
-</mujoco>"""
-
-
-@pytest.mark.parametrize("stiffness", [1700.0, 8000.0])
-def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
-    def drop(speed, gravity):
-        model = mujoco.MjModel.from_xml_string(BALL.format(scene.TIMESTEP, gravity))
-        damping = scene.damping_of(0.08, stiffness, 0.1)
-        contact = scene.spring(model.body_invweight0[:, 0].sum(), stiffness, damping, scene.TIMESTEP)
-        model.pair_solref[0], model.pair_solimp[0] = contact
-        data = mujoco.MjData(model)
-        data.qvel[2] = -speed
-        mujoco.mj_step(model, data, 4000)
-        return data
-
-    assert drop(0.3, 0.0).qvel[2] / 0.3 == pytest.approx(0.08, rel=0.15)
-    assert 0.03 - drop(0.0, GRAVITY).qpos[2] == pytest.approx(0.1 * GRAVITY / stiffness, rel=0.01)
-
-
-def test_a_gear_with_play_loses_that_much_motion(hand, monkeypatch):
-    play, load = 0.02, 0.05
-    plant = world(hand, gear_play=play, gear_stiffness=150.0)
-    plant._scene.model.opt.gravity[:] = 0.0
-    free(plant, (0.5, 0.0, 0.0))  # out of the fingers' way
-    posture = np.array(hand.rotate_posture)
-    plant._data.qpos[plant._scene.drive_qpos] = posture
-    plant.drive(motors(posture))
-    gap, rotor = [], []
-    for way in (1.0, -1.0):
-        # A torque on the link acts on both of its hinges.
-        plant._data.qfrc_applied[plant._scene.play_dof] = way * load
-        step = plant._drives.step
-        with monkeypatch.context() as patch:
-            patch.setattr(plant._drives, "step", lambda *a, way=way, step=step: (step(*a)[0] + way * load, 0.0))
-            plant.advance(0.6)
-        gap.append(plant._data.qpos[plant._scene.play_qpos].copy())
-        rotor.append(plant._data.qpos[plant._scene.drive_qpos].copy())
-    assert gap[0] - gap[1] == pytest.approx(np.full(12, play + 2 * load / 150.0), rel=0.05)
-    assert rotor[0] - rotor[1] == pytest.approx(np.full(12, 2 * load / 3.0), rel=0.05)
-
-
-def test_currents_are_reported_in_milliamperes_positive_when_opening(hand):
-    plant = world(hand, current_noise=0.0, current_gain=1.1)
-    plant._scene.model.opt.gravity[:] = 0.0
-    plant._data.qpos[plant._scene.drive_qpos] = hand.joint_lower
-    plant.drive(motors(hand.joint_lower - 0.1))
-    plant.advance(0.8)
-    free = np.arange(12) != 3  # the index finger swings into the middle one
-    expected = 1000 * 1.1 * 0.3 / hand.torque_limit
-    assert plant.measure().current[free] == pytest.approx(expected[free], rel=0.05)
-
-
-def test_readings_are_as_old_as_drawn(hand):
-    plant = world(hand, sensing_latency=0.0146 + 0.01, encoder_noise=0.0)
-    plant.drive(motors(hand.rotate_posture))
-    shown, true = [], []
-    for _ in range(60):
-        plant.advance(PERIOD)
-        shown.append(plant.measure().joint_position[4])
-        true.append(plant._data.qpos[plant._scene.drive_qpos[4]])
-    assert shown[20:] == pytest.approx(true[10:50], abs=1e-12)
-    assert true[-1] > true[10] + 0.01
-
-
 def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
     def run(seed, first=0):
         plant = EmulatedHand(hand, "grasp", seed, first=first, overrides={"reaction": 0.0})
@@ -185,17 +111,3 @@ def test_the_object_is_held_until_the_targets_move_on(hand):
     assert report["end"].startswith("dropped") and report["fell"] and plant.trial == 1
     plant.advance(0.05)
     assert len(plant.results()) == 1
-
-
-def test_places_are_clear_of_the_hand(hand):
-    for seed in range(12):
-        plant = EmulatedHand(hand, "grasp", seed)
-        data = mujoco.MjData(plant._scene.model)
-        data.qpos[plant._scene.drive_qpos] = hand.grasp_posture
-        put(plant._scene, data, plant._place.position, plant._place.quat)
-        mujoco.mj_forward(plant._scene.model, data)
-        touching = plant._scene.is_object[data.contact.geom].any(-1)
-        assert np.all(data.contact.dist[touching] > -0.0016)
-        up = matrix(plant._place.quat).T @ [-1.0, 0.0, 0.0]
-        top = plant._place.position[0] - plant.shape.reach(up)
-        assert top == pytest.approx(emulated_hand.PALM_FACE + float(plant.parameters.gap))

@@ -5,19 +5,15 @@ import functools
 import operator
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 from episodes import POOL_SIZE
 
-from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.start import CLEARANCE
 from dexsim_ppo.policy import load_policy
-from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant import emulated_hand, parameters, referee
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, is_clear
+from dexsim_real.twin.plant import parameters, referee
 from dexsim_real.twin.plant.parameters import BANDS, FAR, KINDS, NEAR, TASK_BANDS, sample_trial, skill_of, start_of
 
 SKILLS = ("grasp", "rotate", "rotate_clear")  # rotate_any shares all but its objects and its mount with rotate
@@ -66,23 +62,6 @@ def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, task):
     assert np.all(np.abs(starts.mean(0)[-len(place) :] - place) < 0.6 * starts.std(0)[-len(place) :])
 
 
-def test_a_cube_between_the_fingertips_is_put_where_they_carry_it(hand):
-    """A millimetre lower it would overlap with them."""
-    for trial, model in enumerate((None, None, asset_path("plants/foreign_right.xml"))):
-        plant = EmulatedHand(hand, "rotate_clear", 7, first=trial, plant_model=model)
-        place, scene, data = plant._place, plant._scene, mujoco.MjData(plant._scene.model)
-        scene.set_joints(data, plant.start.posture)
-        at, lower = place.position, place.position - 0.001 * plant.up
-        assert is_clear(scene, data, at, place.quat) and not is_clear(scene, data, lower, place.quat)
-
-
-def test_the_fingers_leave_room_where_a_cube_is_put(hand, monkeypatch):
-    """Hands around which no cube fits are drawn anew, which must not choose among them."""
-    monkeypatch.setattr(emulated_hand, "_OBJECTS", 1)
-    for trial in range(15):
-        EmulatedHand(hand, "rotate", 7, first=trial)
-
-
 @pytest.mark.parametrize("task", SKILLS)
 def test_values_are_where_their_kind_says(task):
     """Outside: beyond every possible end of training's range and near it. Fingertips and friction follow nothing of
@@ -102,11 +81,3 @@ def test_values_are_where_their_kind_says(task):
             assert np.all((beyond >= (NEAR - 1e-9) * width) & (beyond <= (FAR + 1e-9) * width)), name
             ends = {"both": {True, False}, "high": {True}, "low": {False}}[band.sides]
             assert set((outside > band.high).ravel().tolist()) == ends, name
-
-
-def test_a_parameter_can_be_fixed():
-    fixed = sample_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
-    assert np.all(fixed.gear_play == 0.002) and fixed.rolling == 0.0
-    assert np.array_equal(fixed.stiffness, sample_trial("grasp", np.random.default_rng(3)).stiffness)
-    with pytest.raises(HandError, match="no parameter 'gaer_play'"):
-        sample_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
