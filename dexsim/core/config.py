@@ -53,18 +53,12 @@ class Config:
         cls: Any = type(self)
         for field in dataclasses.fields(cls):
             where = f"{cls.__name__}.{field.name}"
-            value = _convert(_hints(cls).get(field.name), getattr(self, field.name), where)
+            value = _convert(_hints(cls)[field.name], getattr(self, field.name), where)
             object.__setattr__(self, field.name, value)
             _check_values(field.metadata, value, where)
 
 
-@functools.cache
-def _hints(cls: type) -> dict[str, Any]:
-    """The types of a class's fields; none if one of them is only imported by type checkers."""
-    try:
-        return typing.get_type_hints(cls, include_extras=True)
-    except NameError:
-        return {}
+_hints = functools.cache(functools.partial(typing.get_type_hints, include_extras=True))
 
 
 def _check_values(metadata: Any, value: Any, where: str) -> None:
