@@ -161,11 +161,9 @@ def _check_closed(mesh: Trimesh, size: float) -> None:
         raise AssetError(f"{name}: the surface is {what}{more} (ObjectConfig.mesh_repair closes it: shell or hull)")
     if not mesh.is_winding_consistent:
         raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
-    volume = float(mesh.volume)
-    if abs(volume) < 1e-6 * size**3:
-        raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
-    if volume < 0:
-        raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
+    if mesh.volume < 1e-6 * size**3:
+        wrong = "it is flat, or its normals point inward: mesh.invert() turns it"
+        raise AssetError(f"{name}: encloses {mesh.volume:.3g} m^3 for a size of {size:.3g} m; {wrong}")
 
 
 def _hull(mesh: Trimesh) -> Trimesh:

@@ -39,9 +39,9 @@ def bad_meshes():
     return {
         "open": (vertices, faces[:-1]),
         "non-manifold: 1 edges have more than two": touching,
-        "inward": turned(box.copy()),
+        "encloses -.* inward": turned(box.copy()),
         "both ways": (vertices, mixed),
-        "no volume": box.copy().apply_scale([1, 1, 1e-9]),
+        "is flat": box.copy().apply_scale([1, 1, 1e-9]),
         "scale=0.001": (1000 * vertices, faces),
         "6e-05 m across": (1e-3 * vertices, faces),
         "nowhere.stl": "nowhere.stl",
