@@ -113,17 +113,13 @@ def read_mjcf(path: Path) -> bytes:
 
 def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
     """MuJoCo looks beside the model first, in `top`, then beside the file that includes, in `folder`."""
-    children = []
-    for child in list(element):
-        if child.tag != "include":
-            _paste_includes(child, top, folder)
-            children.append(child)
-            continue
-        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
-        included = ElementTree.parse(file).getroot()
-        _paste_includes(included, top, file.parent)
-        children += included
-    element[:] = children
+    for parent in list(element.iter()):
+        for child in parent.findall("include"):
+            file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
+            included = ElementTree.parse(file).getroot()
+            _paste_includes(included, top, file.parent)
+            place = list(parent).index(child)
+            parent[place : place + 1] = included
 
 
 def digest_of(*files: Path) -> str:
