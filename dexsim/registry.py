@@ -8,7 +8,6 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
-import os
 import typing
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -126,7 +125,7 @@ def task_option(name: str) -> str:
 def make(
     task: str, config: EnvConfig | None = None, *, backend: str = "auto", hand: Hand | None = None, seed: int = 0
 ) -> Env:
-    """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is set.
+    """An environment. Compiled programs are kept between runs (`enable_caches`).
 
     Args:
       task: a name in `TASKS`, registered ones included.
@@ -138,8 +137,7 @@ def make(
     Raises:
       ConfigError: unknown task, or a config of another task.
     """
-    cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
+    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         cli.enable_caches()
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
