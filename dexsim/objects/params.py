@@ -66,12 +66,8 @@ def bounding_radius(size: jax.Array, kinds: tuple[str, ...]) -> jax.Array:
 
 def extent(object: ObjectParams, direction: jax.Array) -> jax.Array:
     """How far [] m the object reaches along a unit `direction` [3] of its own frame."""
-    reaches = []
-    for k, kind in enumerate(object.kinds):
-        local = direction
-        if object.quat is not None:
-            local = rotations.rotate_inverse(rotations.quat_to_matrix(object.quat[k]), direction)
-        along, (a, b, c) = jnp.abs(local), object.size[k]
+    reaches, local = [], jnp.abs(rotations.rotate_inverse(object.shape().rotation, direction[None]))
+    for along, kind, (a, b, c) in zip(local, object.kinds, object.size, strict=True):
         reach_of = {
             "box": along[0] * a + along[1] * b + along[2] * c,
             "capsule": a + b * along[2],
