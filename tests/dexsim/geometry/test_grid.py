@@ -91,7 +91,6 @@ def test_values_are_scipys_interpolation():
     corners = [np.roll(cube.reshape(-1), -((x * n + y) * n + z)) for x, y, z in np.ndindex(2, 2, 2)]
     origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
     baked = grid.Grid(
-        nodes=n,
         values=jnp.asarray(np.stack(corners, -1).reshape(n, n * n, 8)),
         origin=jnp.asarray(origin, jnp.float32),
         spacing=jnp.asarray(step, jnp.float32),
