@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.env.motors import check_timestep
 from dexsim.core.errors import ConfigError
+from dexsim.env.motors import check_timestep
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.law import implicit
 from dexsim.randomization import Randomization
