@@ -7,8 +7,6 @@ boundary plus the way there.
 Shapes: n nodes along each axis. Units: m.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

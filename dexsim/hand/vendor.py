@@ -13,6 +13,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
 
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, primitive_mesh
@@ -148,8 +149,6 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoc
 
 def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, bytes], notes: list[str]) -> bool:
     """Put the mesh of a visual or collision element, if it has one, into `assets`; whether the element has a shape."""
-    import trimesh
-
     shape = element.find("geometry/mesh")
     if shape is None:
         return element.find("geometry/*") is not None
@@ -212,15 +211,12 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
             bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
             raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
         return at
-    fingers: list[list[int]] = []
-    for body in sorted({int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}):
-        chain = [body]
-        while chain[-1]:
-            chain.append(int(model.body_parentid[chain[-1]]))
-        fingers = [other for other in fingers if other[0] not in chain] + [chain]  # parents come before children
-    if len(fingers) < 2:
-        raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
-    return next(body for body in fingers[0] if all(body in chain for chain in fingers))
+    parents, moving = model.body_parentid, {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
+    tips = [body for body in moving if not any(is_below(parents, other, body) for other in moving - {body})]
+    if len(tips) < 2:
+        raise ConfigError(f"expected a hand of two fingers or more, got {len(tips)} chains of hinges")
+    # Parents come before children.
+    return max(body for body in range(model.nbody) if all(is_below(parents, tip, body) for tip in tips))
 
 
 def _read_followers(
@@ -335,8 +331,6 @@ def _pose_in_palm_frame(model: mujoco.MjModel, palm: int) -> mujoco.MjData:
 
 def _read_body(model: mujoco.MjModel, data: mujoco.MjData, body: int, moving: Collection[int]) -> dict[str, Any]:
     """Name, mass and surface of a body with all that is fixed to it: fields of `Link`."""
-    import trimesh
-
     members = [body]
     for other in range(body + 1, model.nbody):
         if int(model.body_parentid[other]) in members and other not in moving:
@@ -357,8 +351,6 @@ def _read_body(model: mujoco.MjModel, data: mujoco.MjData, body: int, moving: Co
 
 def _read_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[Any]:
     """The shapes of a body: its meshes, or else its primitives."""
-    import trimesh
-
     geoms = np.flatnonzero(model.geom_bodyid == body)
     meshes = geoms[model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH]
     shapes = []

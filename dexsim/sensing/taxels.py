@@ -12,8 +12,6 @@ the converter, and its own sampling rate. Effects with a range are off by defaul
 Shapes: F fingers, N taxels a finger.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax
