@@ -166,7 +166,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     for kind, names in catalog().items():
         print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
     return 0
-
-
-if __name__ == "__main__":
-    cli.run(main)
