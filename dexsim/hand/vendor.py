@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import trimesh
 
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, primitive_mesh
 from dexsim.hand.fit import Capsule, PalmBox
@@ -26,6 +27,33 @@ _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
 _LARGEST = 2.0  # m, of a link: none of a hand is so large
+
+
+Direction = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImportOptions(Config):
+    """What a file does not say, or what is to be read otherwise."""
+
+    palm: str = ""
+    """Body of the palm; empty for the one where all fingers begin."""
+    thumb: str = ""
+    """A link or joint of the thumb; empty to find it."""
+    fingers: Direction | None = None
+    """Direction in the file's axes in which the fingers point, as 0 0 1; None to find it."""
+    normal: Direction | None = None
+    """Direction in the file's axes that the palm faces; None to find it."""
+    freeze: tuple[str, ...] = ()
+    """Joints to fix at 0. Joints above the palm are fixed anyway."""
+    couple: tuple[str, ...] = ()
+    """FOLLOWER=LEADER:RATIO: a joint that follows another by a tendon."""
+    drop_tendons: bool = False
+    """Leave tendons out; see --couple."""
+    torque: float = setting(0.0, unit="Nm", low=0.0, high=100.0)
+    """Stall torque of all motors; 0 for the file's."""
+    speed: float = setting(0.0, unit="rad/s", low=0.0, high=1000.0)
+    """No-load speed of all motors; 0 for the file's."""
 
 
 @dataclasses.dataclass(eq=False, kw_only=True)
@@ -77,16 +105,8 @@ class Draft:
         return [self.links[at] for at in order if self.links[at].is_motor]
 
 
-def read_hand(
-    path: Path, *, palm: str = "", freeze: Sequence[str] = (), couple: Sequence[str] = (), drop_tendons: bool = False
-) -> Draft:
+def read_hand(path: Path, options: ImportOptions) -> Draft:
     """Read a hand from a URDF or MJCF.
-
-    Args:
-      palm: its body; empty for the one where all fingers begin.
-      freeze: joints that are to be fixed at 0.
-      couple: FOLLOWER=LEADER:RATIO of joints that a tendon couples.
-      drop_tendons: leave tendons out.
 
     Raises:
       AssetError: not readable, not a hand, or something that a hand's folder cannot hold.
@@ -98,11 +118,11 @@ def read_hand(
             raise ConfigError(f"expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
         spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
         if spec.tendons:
-            _drop_tendons(spec, drop_tendons)
+            _drop_tendons(spec, options.drop_tendons)
         # Velocity limits, which MuJoCo does not read.
         limits = [(joint.get("name", ""), limit) for joint in root.findall("joint") for limit in joint.findall("limit")]
         speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits}
-        links = _read_links(spec.compile(), palm, freeze, couple, speeds, notes)
+        links = _read_links(spec.compile(), options, speeds, notes)
         for link in links:
             if link.surface is not None and np.max(link.surface.extents) > _LARGEST:
                 long = f"link {link.name} is {np.max(link.surface.extents):.0f} m long"
@@ -262,26 +282,21 @@ def _stall_torques(model: mujoco.MjModel) -> dict[int, float]:
 
 
 def _read_links(
-    model: mujoco.MjModel,
-    palm_name: str,
-    freeze: Sequence[str],
-    couple: Sequence[str],
-    speeds: dict[str, float],
-    notes: list[str],
+    model: mujoco.MjModel, options: ImportOptions, speeds: dict[str, float], notes: list[str]
 ) -> list[Link]:
     """The palm and a link for each hinge below it that is not frozen; of two hinges on one body the first moves a link
     without a shape."""
-    names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
+    names, freeze = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)], options.freeze
     if unknown := set(freeze) - set(names):
         raise ConfigError(f"--freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
-    palm = _find_palm(model, palm_name, {j for j, joint in enumerate(names) if joint in freeze})
+    palm = _find_palm(model, options.palm, {j for j, joint in enumerate(names) if joint in freeze})
     below = [b for b in range(model.nbody) if b != palm and is_below(model.body_parentid, b, palm)]
     joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
     if frozen := [name for j, name in enumerate(names) if j not in joints]:
         notes.append(f"frozen at 0  {', '.join(frozen)}: above the palm, or by --freeze")
     if other := [names[j] for j in joints if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]:
         raise ConfigError(f"joint {other[0]!r} is not a hinge: --freeze {other[0]} fixes it at 0")
-    followers, torques = _read_followers(model, names, joints, couple, notes), _stall_torques(model)
+    followers, torques = _read_followers(model, names, joints, options.couple, notes), _stall_torques(model)
     data = _pose_in_palm_frame(model, palm)
     last = {int(model.jnt_bodyid[j]): j for j in joints}  # of each body that moves
     links, row = [Link(parent=-1, **_read_body(model, data, palm, last))], {palm: 0}
