@@ -18,13 +18,14 @@ import numpy as np
 import trimesh
 import tyro
 
+from dexsim.calibration.press import lever_arms
 from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient, tip_of
+from dexsim.hand.description import Hand
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import write_hand
-from dexsim.hand.kinematics import fingertip_strength
 from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import check_new, swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp
@@ -88,7 +89,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
         posture, centre, gaps = find_grasp(hand, gap)
         # A finger's highest target is the thumb's strength, shared by the fingers that press at once, or the weakest
         # finger's; the lowest is a quarter of it, as on the XHand, or what carries an object.
-        thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
+        thumb, *others = fingertip_strength(hand, posture)
         highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
         lowest = min(max(highest / 4, _CARRYING), highest)
         grasp: dict[str, Any] = {"posture": posture, "centre": centre, "finger_force": [lowest, highest]}
@@ -104,6 +105,14 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     ]
     print("\n".join([*lines, *draft.findings[said:], *checks]))
     return path, passed
+
+
+def fingertip_strength(hand: Hand, joint_position: np.ndarray) -> np.ndarray:
+    """Largest force [F] N of each fingertip along its taxels' mean normal that leaves every joint within its stall
+    torque: a static press in one posture, without gravity and friction."""
+    share = np.full(hand.num_taxels, 1 / hand.num_taxels)
+    levers = np.abs([lever_arms(hand, joint_position, finger, share) for finger in range(hand.num_fingers)])
+    return (hand.torque_limit / np.maximum(levers, 1e-6)).min(-1)
 
 
 def fit_links(draft: Draft, options: ImportOptions) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.geometry import rotations
-from dexsim.hand.description import Hand, unit
+from dexsim.hand.description import Hand
 
 
 @pytree_dataclass
@@ -96,21 +96,6 @@ def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
             if hand.body_joint[body] >= 0 and cosine > 0.7:
                 joints.add(int(hand.body_joint[body]))
     return np.array(sorted(joints), int)
-
-
-def fingertip_strength(hand: Hand, joint_position: Array) -> np.ndarray:
-    """Largest force [F] N of each fingertip along its taxels' mean normal that leaves every joint within its stall
-    torque: a static press in one posture, without gravity and friction.
-
-    A force f along the unit vector n at the pad's middle p loads the joints with f (dp/dq)^T n.
-    """
-
-    def pads(joints: Array) -> jax.Array:
-        return taxel_positions(hand, forward_kinematics(hand, joints)).mean(1)
-
-    facing = unit(np.asarray(taxel_normals(hand, forward_kinematics(hand, joint_position)).mean(1)))
-    lever = np.abs(np.einsum("fk,fkj->fj", facing, jax.jit(jax.jacfwd(pads))(joint_position)))
-    return (hand.torque_limit / np.maximum(lever, 1e-6)).min(-1)
 
 
 def tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ from dexsim import check_hand, import_hand
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
 from dexsim.hand.folder import write_hand
-from dexsim.hand.kinematics import fingertip_strength, forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.posture import find_grasp
 from dexsim.hand.vendor import ImportOptions, read_hand
@@ -148,7 +148,7 @@ def test_the_whole_command(tmp_path, capsys):
     np.testing.assert_allclose(sorted(set(hand.body_ratio.round(5))), [0.8, 1.0])
     # What the thumb can oppose, and gains in proportion to stall torques.
     low, high = Grasp(GraspConfig(), hand).finger_force
-    thumb, *others = fingertip_strength(hand, np.float32(hand.grasp_posture))
+    thumb, *others = import_hand.fingertip_strength(hand, np.array(hand.grasp_posture))
     assert low == pytest.approx(max(high / 4, 1.0), abs=1e-3)
     assert high == pytest.approx(min(thumb / 2.75, *others), abs=1e-3)
     nominal = sample_hand(jax.random.key(0), Randomization(scale=0), hand, timestep=0.01, control_period=0.03)
