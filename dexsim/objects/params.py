@@ -15,16 +15,9 @@ import numpy as np
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
-from dexsim.objects.config import (
-    INACTIVE_SIZE,
-    KINDS,
-    PROPERTY_RANGES,
-    SHAPES,
-    SLOTS,
-    SPHERE_HALF_LENGTH,
-    ObjectConfig,
-    load_mesh_object,
-)
+from dexsim.objects.config import INACTIVE_SIZE, KINDS, PROPERTY_RANGES, SHAPES, SLOTS, ObjectConfig, load_mesh_object
+
+_SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
 @pytree_dataclass
@@ -227,7 +220,7 @@ def _sample_slots(
     body_half = jnp.where(box_body, half[2], length)
     capsule = jnp.where(
         is_sphere,
-        jnp.stack([ball, SPHERE_HALF_LENGTH]),
+        jnp.stack([ball, _SPHERE_HALF_LENGTH]),
         jnp.where(is_union, jnp.stack([neck, neck_half]), jnp.stack([radius, length])),
     )
     zero = jnp.zeros(())
