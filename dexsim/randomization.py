@@ -136,8 +136,8 @@ def sample_hand(
     spans = [getattr(config, name) for name in NOMINAL]
     spans = [(-span, span) if name in _DEVIATIONS else span for name, span in zip(NOMINAL, spans, strict=True)]
     keys, extreme = jax.random.split(key, 20), sample_extreme(key, config.extremes)
-    drawn = uniforms(keys[_KEYS], spans, extreme, shape, nominal=nominal, beyond=config.beyond)
-    rows = nominal[:, None] + config.scale * scale * (drawn - nominal[:, None])
+    raw = uniforms(keys[_KEYS], spans, extreme, shape, nominal=list(NOMINAL.values()), beyond=config.beyond)
+    rows = nominal[:, None] + config.scale * scale * (raw - nominal[:, None])
     drawn = dict(zip(NOMINAL, rows, strict=True))
     values, joints = {name: row[: hand.num_joints] for name, row in drawn.items()}, (hand.num_joints,)
     limit, gain, (low, high) = jnp.asarray(hand.torque_limit), jnp.asarray(hand.gain), config.ripple_count

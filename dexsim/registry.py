@@ -7,6 +7,7 @@ env = dexsim.make("poke")
 import dataclasses
 import importlib
 import importlib.metadata
+import inspect
 import typing
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -72,7 +73,7 @@ def register(name: str, factory: Callable[[Any, Hand], Task]) -> None:
     where = f"register({name!r}, ...)"
     if not name.isidentifier():
         raise ConfigError(f"{where}: the name must be a word, such as 'poke'")
-    hints = typing.get_type_hints(factory.__init__ if isinstance(factory, type) else factory)
+    hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
     config = next(iter(hints.values()), None)
     if not (isinstance(config, type) and issubclass(config, EnvConfig)):
         raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig")
