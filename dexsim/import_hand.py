@@ -21,15 +21,14 @@ import tyro
 from dexsim.calibration.press import fingertip_strength
 from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
-from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
-from dexsim.hand.anatomy import Direction, orient, tip_of
+from dexsim.hand.anatomy import orient, tip_of
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import write_hand
 from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import check_new, swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp
-from dexsim.hand.vendor import LEAST_MASS, Draft, Link, read_hand
+from dexsim.hand.vendor import LEAST_MASS, Draft, ImportOptions, Link, read_hand
 
 _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
@@ -41,7 +40,7 @@ _DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportArguments(Config):
+class ImportArguments(ImportOptions):
     """Make a hand's folder from a maker's URDF or MJCF."""
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -51,24 +50,6 @@ class ImportArguments(Config):
     """Folder to write, without a hand of its name."""
     mirror: bool = False
     """Write the mirror image: a left hand of a right one, or the other way round."""
-    palm: str = ""
-    """Body of the palm; empty for the one where all fingers begin."""
-    thumb: str = ""
-    """A link or joint of the thumb; empty to find it."""
-    fingers: Direction | None = None
-    """Direction in the file's axes in which the fingers point, as 0 0 1; None to find it."""
-    normal: Direction | None = None
-    """Direction in the file's axes that the palm faces; None to find it."""
-    freeze: tuple[str, ...] = ()
-    """Joints to fix at 0. Joints above the palm are fixed anyway."""
-    couple: tuple[str, ...] = ()
-    """FOLLOWER=LEADER:RATIO: a joint that follows another by a tendon."""
-    drop_tendons: bool = False
-    """Leave tendons out; see --couple."""
-    torque: float = setting(0.0, unit="Nm", low=0.0, high=100.0)
-    """Stall torque of all motors; 0 for the file's."""
-    speed: float = setting(0.0, unit="rad/s", low=0.0, high=1000.0)
-    """No-load speed of all motors; 0 for the file's."""
     yes: bool = False
     """Take the palm frame as found, without a question."""
 
@@ -91,14 +72,8 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     name = re.sub(r"\W", "_", arguments.out.resolve().name)  # the folder's
     name = swap_sides(name) if arguments.mirror else name
     check_new(folder / f"{name}.toml", folder / f"{name}.xml")
-    draft = read_hand(
-        arguments.file,
-        palm=arguments.palm,
-        freeze=arguments.freeze,
-        couple=arguments.couple,
-        drop_tendons=arguments.drop_tendons,
-    )
-    orient(draft, thumb=arguments.thumb, along=arguments.fingers, normal=arguments.normal)
+    draft = read_hand(arguments.file, arguments)
+    orient(draft, arguments)
     print("\n".join(draft.findings))
     if not arguments.yes:
         if not sys.stdin.isatty():
@@ -106,14 +81,14 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
         if input("Is this palm frame right? [y/N] ").strip().lower() not in ("y", "yes"):
             raise ConfigError("give --fingers, --normal, --thumb or --palm")
     said = len(draft.findings)
-    fit_links(draft, arguments.torque, arguments.speed)
+    fit_links(draft, arguments)
     remarks = [f"Imported from {arguments.file.name} by dexsim import-hand.", *draft.findings]
     hand = load_hand(write_hand(draft, name, remarks, folder))
     for gap in _GAPS:
         posture, centre, gaps = find_grasp(hand, gap)
         # A finger's highest target is the thumb's strength, shared by the fingers that press at once, or the weakest
         # finger's; the lowest is a quarter of it, as on the XHand, or what carries an object.
-        thumb, *others = fingertip_strength(hand, posture.astype(np.float32))
+        thumb, *others = fingertip_strength(hand, posture)
         highest = float(np.clip(min(thumb / min(_PRESSING, len(others)), *others), 0.05, 40.0))
         lowest = min(max(highest / 4, _CARRYING), highest)
         grasp: dict[str, Any] = {"posture": posture, "centre": centre, "finger_force": [lowest, highest]}
@@ -131,11 +106,8 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     return path, passed
 
 
-def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
+def fit_links(draft: Draft, options: ImportOptions) -> None:
     """Limits, masses and capsules of all links, and the palm's box.
-
-    Args:
-      torque, speed: of all motors, Nm and rad/s; 0 for the file's.
 
     Raises:
       AssetError: a finger has no motor.
@@ -144,8 +116,8 @@ def fit_links(draft: Draft, torque: float = 0.0, speed: float = 0.0) -> None:
     for name, chain in draft.fingers.items():
         if not any(links[at].is_motor for at in chain):
             raise AssetError(f"finger {name!r} ({links[chain[-1]].name}) has no motor of its own")
-    _assume_limits(draft, "torque", torque, TORQUES, _TORQUE, "Nm")
-    _assume_limits(draft, "speed", speed, SPEEDS, _SPEED, "rad/s")
+    _assume_limits(draft, "torque", options.torque, TORQUES, _TORQUE, "Nm")
+    _assume_limits(draft, "speed", options.speed, SPEEDS, _SPEED, "rad/s")
     motors = {motor.joint: motor for motor in draft.motors}
     for link in links:
         if link.leader:  # its range is where its motor takes it

@@ -5,6 +5,7 @@ know which world it is in. Shapes: J joints, F fingers, N taxels a finger.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -189,9 +190,12 @@ def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tup
     joints, vector, quat = (jnp.zeros(size) for size in (hand.num_joints, 3, 4))
     past, taxels, command = jnp.stack([joints] * 2), jnp.zeros(hand.taxel_area.shape), jnp.zeros(())
     readings = Readings(joints, joints, taxels, vector, vector, quat, quat, command, joints, past, vector)
-    parts = jax.eval_shape(lambda: _compute(hand, readings, names, config, Motion(joints, vector)))
-    fields = [FIELDS[name] for name in select_fields(names, config)]
-    return tuple(map(LayoutEntry, (f.name for f in fields), (part.size for part in parts), (f.scale for f in fields)))
+    motion, alone = Motion(joints, vector), dataclasses.replace(config, leave_out=(), add=())
+    entries = []
+    for name in select_fields(names, config):
+        part = jax.eval_shape(functools.partial(observe, hand, readings, (name,), alone, motion))
+        entries.append(LayoutEntry(name, part.size, FIELDS[name].scale))
+    return tuple(entries)
 
 
 def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
@@ -226,19 +230,8 @@ def observe(
     if hand.side == "left":
         motion = motion and Motion(motion.joint_velocity, motion.object_spin * AXIAL)
         return observe(mirror_hand(hand), mirror_readings(readings), names, config, motion)
-    return jnp.concatenate(_compute(hand, readings, names, config, motion, pose)).astype(jnp.float32)
-
-
-def _compute(
-    hand: Hand,
-    readings: Readings,
-    names: tuple[str, ...],
-    config: ObservationConfig,
-    motion: Motion | None,
-    pose: HandPose | None = None,
-) -> list[jax.Array]:
-    """The values of each field."""
     pose = forward_kinematics(hand, readings.joint_position) if pose is None else pose
     contact = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(hand, readings, config, motion, pose, *contact)
-    return [FIELDS[name].compute(features) for name in select_fields(names, config)]
+    parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
+    return jnp.concatenate(parts).astype(jnp.float32)

@@ -131,10 +131,16 @@ def sample_hand(
       timestep, control_period: s, of a physics sub-step and a control tick.
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """
-    drawn = _draw(key, config, hand, config.scale * scale)
+    # A row of values for every name: as many as the hand has joints or fingers, and two at least.
+    shape, nominal = (max(hand.num_joints, hand.num_fingers, 2),), np.array(list(NOMINAL.values()), np.float32)
+    spans = [getattr(config, name) for name in NOMINAL]
+    spans = [(-span, span) if name in _DEVIATIONS else span for name, span in zip(NOMINAL, spans, strict=True)]
+    keys, extreme = jax.random.split(key, 20), sample_extreme(key, config.extremes)
+    raw = uniforms(keys[_KEYS], spans, extreme, shape, nominal=list(NOMINAL.values()), beyond=config.beyond)
+    rows = nominal[:, None] + config.scale * scale * (raw - nominal[:, None])
+    drawn = dict(zip(NOMINAL, rows, strict=True))
     values, joints = {name: row[: hand.num_joints] for name, row in drawn.items()}, (hand.num_joints,)
-    keys, limit, (low, high) = jax.random.split(key, 20), jnp.asarray(hand.torque_limit), config.ripple_count
-    gain = jnp.asarray(hand.gain)
+    limit, gain, (low, high) = jnp.asarray(hand.torque_limit), jnp.asarray(hand.gain), config.ripple_count
     actuator = Actuator(
         stiffness=config.stiffness * gain * values["stiffness_factor"],
         damping=config.damping * gain * values["damping_factor"],
@@ -159,17 +165,6 @@ def sample_hand(
         tilt=drawn["gravity_tilt"][:2],
         pad_thickness_delta=values["pad_thickness_delta"][0],
     )
-
-
-def _draw(key: jax.Array, config: Randomization, hand: Hand, width: jax.Array | float) -> dict[str, jax.Array]:
-    """A row of values for every name of `NOMINAL`: as many as the hand has joints or fingers, and two at least."""
-    shape, nominal = (max(hand.num_joints, hand.num_fingers, 2),), np.array(list(NOMINAL.values()), np.float32)
-    spans = [getattr(config, name) for name in NOMINAL]
-    spans = [(-span, span) if name in _DEVIATIONS else span for name, span in zip(NOMINAL, spans, strict=True)]
-    keys, extreme = jax.random.split(key, 20)[_KEYS], sample_extreme(key, config.extremes)
-    drawn = uniforms(keys, spans, extreme, shape, nominal=list(NOMINAL.values()), beyond=config.beyond)
-    rows = nominal[:, None] + width * (drawn - nominal[:, None])
-    return dict(zip(NOMINAL, rows, strict=True))
 
 
 def tilted_down(down: np.ndarray, tilt: jax.Array) -> jax.Array:

@@ -8,7 +8,6 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
-import os
 import typing
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -57,9 +56,7 @@ OURS = tuple(TASKS)
 _MODULES: dict[str, str] = {}  # that tasks were found in, by their names
 
 
-def register(
-    name: str, factory: Callable[[Any, Hand], Task], config: type[EnvConfig] | Callable[[], EnvConfig] | None = None
-) -> None:
+def register(name: str, factory: Callable[[Any, Hand], Task]) -> None:
     """Add a task, so that `make`, training, evaluation and resuming find it by name.
 
     Commands find it too where `--task` names the module that registers it (`--task my_module:poke`), or where an
@@ -67,9 +64,8 @@ def register(
 
     Args:
       name: a word; must be new, unless the same factory is registered again (a notebook cell that is run twice).
-      factory: `factory(config, hand) -> Task`, usually the task's class.
-      config: its configuration class, an `EnvConfig`, or a function without arguments that makes the default
-        configuration. By default the type annotation of the factory's first parameter.
+      factory: `factory(config, hand) -> Task`, usually the task's class. The type annotation of its first parameter
+        is the task's configuration class, an `EnvConfig`.
 
     Raises:
       ConfigError: the name is taken or no word, or no configuration class can be found.
@@ -77,11 +73,10 @@ def register(
     where = f"register({name!r}, ...)"
     if not name.isidentifier():
         raise ConfigError(f"{where}: the name must be a word, such as 'poke'")
-    if config is None:
-        hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
-        config = hints.get(next(iter(inspect.signature(factory).parameters)), type(None))
-    if not isinstance(config(), EnvConfig):
-        raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig, or give config=")
+    hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
+    config = next(iter(hints.values()), None)
+    if not (isinstance(config, type) and issubclass(config, EnvConfig)):
+        raise ConfigError(f"{where}: annotate the factory's first parameter with its EnvConfig")
     taken = TASKS.get(name)
     if taken is not None and getattr(taken.task, "__qualname__", None) != getattr(factory, "__qualname__", ""):
         raise ConfigError(f"{where}: there is a task of that name already")
@@ -126,7 +121,7 @@ def task_option(name: str) -> str:
 def make(
     task: str, config: EnvConfig | None = None, *, backend: str = "auto", hand: Hand | None = None, seed: int = 0
 ) -> Env:
-    """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is set.
+    """An environment. Compiled programs are kept between runs (`enable_caches`).
 
     Args:
       task: a name in `TASKS`, registered ones included.
@@ -138,8 +133,7 @@ def make(
     Raises:
       ConfigError: unknown task, or a config of another task.
     """
-    cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
+    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         cli.enable_caches()
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
@@ -173,7 +167,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     for kind, names in catalog().items():
         print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
     return 0
-
-
-if __name__ == "__main__":
-    cli.run(main)

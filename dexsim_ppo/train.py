@@ -29,7 +29,6 @@ import dexsim
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
-from dexsim.core.files import read_small
 from dexsim.core.install import require
 from dexsim.hand.source import record_of
 from dexsim.registry import catalog, find_task, task_option
@@ -235,7 +234,7 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     """The options in `config.json` of a run, or of the run in this folder. Raises ConfigError if of another task."""
     file = RunFolder(path).config if path.is_dir() else path
     try:
-        saved = json.loads(read_small(file))["arguments"]
+        saved = json.loads(file.read_bytes())["arguments"]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
     if task and task.rpartition(":")[2] != saved["task"]:

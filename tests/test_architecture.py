@@ -17,7 +17,6 @@ PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 FLOORS = {
     "dexsim": (
         ("core",),
-        ("errors",),
         ("geometry", "actuator"),
         ("hand",),
         ("objects", "control", "randomization", "touch"),

@@ -66,11 +66,11 @@ def demanded_torque(
 def joint_torque(
     actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
-    """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
+    """Torque of the motors, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
     This is the torque that corresponds to the motor's current; `apply_friction` subtracts the gear's friction.
 
-    Args: scalars, or arrays that broadcast; `drive` is this, vmapped over the joints.
+    Args: scalars, of one joint, or arrays [J] of all, which broadcast.
     """
     torque = demanded_torque(actuator, target, target_velocity, position, velocity)
     limit = torque_limit(actuator, velocity)
@@ -81,15 +81,10 @@ def joint_torque(
     return torque * (1.0 + actuator.ripple * jnp.sin(angle))
 
 
-drive = jax.vmap(joint_torque)
-"""`joint_torque` over joints: an `Actuator` of [J] leaves and arrays [J] to torques [J] Nm."""
-
-
-@jax.vmap
 def at_limit(
     actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
-    """Whether joints [J] bool are at their torque limit: |tau_b| >= tau_sat. The arguments are those of `drive`."""
+    """Whether joints [J] bool are at their torque limit: |tau_b| >= tau_sat. Arguments as of `joint_torque`."""
     torque = demanded_torque(actuator, target, target_velocity, position, velocity)
     return jnp.abs(torque) >= torque_limit(actuator, velocity)
 

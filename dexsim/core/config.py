@@ -12,14 +12,11 @@ import math
 import types
 import typing
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from dexsim.core.errors import ConfigError
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-T = TypeVar("T", bound="DataclassInstance")
+T = TypeVar("T")
 Range = Annotated[tuple[float, float], "low and high, in order"]
 """The type of a field that is a range (low, high)."""
 
@@ -53,36 +50,11 @@ class Config:
         cls: Any = type(self)
         for field in dataclasses.fields(cls):
             where = f"{cls.__name__}.{field.name}"
-            value = _convert(_hints(cls).get(field.name), getattr(self, field.name), where)
+            value = _convert(_hints(cls)[field.name], getattr(self, field.name), where, field.metadata)
             object.__setattr__(self, field.name, value)
-            _check_values(field.metadata, value, where)
 
 
-@functools.cache
-def _hints(cls: type) -> dict[str, Any]:
-    """The types of a class's fields; none if one of them is only imported by type checkers."""
-    try:
-        return typing.get_type_hints(cls, include_extras=True)
-    except NameError:
-        return {}
-
-
-def _check_values(metadata: Any, value: Any, where: str) -> None:
-    """Hold a field's value, or each item of a tuple, to the choices and the range of its `setting`."""
-    choices, low, high = metadata.get("choices"), metadata.get("low", -math.inf), metadata.get("high", math.inf)
-    unit = f" {metadata['unit']}" if metadata.get("unit", "1") not in ("", "1") else ""
-    for item in value if isinstance(value, tuple) else (value,):
-        if isinstance(item, tuple):
-            _check_values(metadata, item, where)
-            continue
-        if choices is not None and item is not None and item not in choices:
-            raise ConfigError(f"{where} = {item!r:.80}: choose from {', '.join(map(str, choices))}")
-        if isinstance(item, bool) or not isinstance(item, (int, float)):
-            continue
-        if isinstance(item, float) and not math.isfinite(item):
-            raise ConfigError(f"{where} = {item}: must be a finite number")
-        if not low <= item <= high:
-            raise ConfigError(f"{where} = {item:.10g}{unit}: must be between {low:.10g} and {high:.10g}{unit}")
+_hints = functools.cache(functools.partial(typing.get_type_hints, include_extras=True))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +74,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     unknown field, or a value of the wrong type or out of range."""
     if not isinstance(data, dict):
         raise ConfigError(f"{cls.__name__}: expected a table of fields, got {type(data).__name__}")
-    fields = {field.name: field for field in dataclasses.fields(cls)}
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for name in data:
         if name not in fields:
             raise ConfigError(f"{cls.__name__} has no field {name!r:.80}")
@@ -157,13 +129,14 @@ def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """A value as its type has it: tuples for lists, Python's numbers for NumPy's, configurations for tables."""
+def _convert(hint: Any, value: Any, where: str, metadata: Any) -> Any:
+    """A value as its type has it: tuples for lists, Python's numbers for NumPy's, configurations for tables. It, or
+    each item of a tuple, is held to the choices and the range of its `setting`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hasattr(value, "tolist"):
         value = value.tolist()
     if origin is Annotated:
-        value = _convert(arguments[0], value, where)
+        value = _convert(arguments[0], value, where, metadata)
         if hint == Range and value[0] > value[1]:
             low, high = value
             raise ConfigError(f"{where} = ({low:.10g}, {high:.10g}): the first must not exceed the second")
@@ -172,9 +145,10 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return value if isinstance(value, hint) else from_dict(hint, value)
     if origin in (typing.Union, types.UnionType):
         options = [argument for argument in arguments if argument is not type(None)]
-        if (value is None and len(options) < len(arguments)) or len(options) != 1:
+        if value is None and len(options) < len(arguments):
             return value
-        return _convert(options[0], value, where)
+        if len(options) == 1:
+            return _convert(options[0], value, where, metadata)
     if origin is typing.Literal and value not in arguments:
         raise ConfigError(f"{where} = {value!r:.80}: choose from {', '.join(map(str, arguments))}")
     if origin is tuple:
@@ -184,9 +158,17 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             arguments = arguments[:1] * len(value)
         if len(value) != len(arguments):
             raise ConfigError(f"{where}: expected {len(arguments)} values, got {len(value)}")
-        return tuple(_convert(a, item, where) for a, item in zip(arguments, value, strict=True))
+        return tuple(_convert(a, item, where, metadata) for a, item in zip(arguments, value, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        value = float(value)
     if hint in (bool, int, float, str) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
         raise ConfigError(f"{where} = {value!r:.80}: expected {hint.__name__}")
+    choices, low, high = metadata.get("choices"), metadata.get("low", -math.inf), metadata.get("high", math.inf)
+    unit = f" {metadata['unit']}" if metadata.get("unit", "1") not in ("", "1") else ""
+    if choices is not None and value not in choices:
+        raise ConfigError(f"{where} = {value!r:.80}: choose from {', '.join(map(str, choices))}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} = {value}: must be a finite number")
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and not low <= value <= high:
+        raise ConfigError(f"{where} = {value:.10g}{unit}: must be between {low:.10g} and {high:.10g}{unit}")
     return value

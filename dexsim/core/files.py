@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, and reading small files."""
+"""Writing a file whole or not at all, and reading a TOML."""
 
 import contextlib
 import os
@@ -8,8 +8,6 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-
-_SMALL = 1 << 20  # bytes
 
 
 def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
@@ -55,17 +53,8 @@ def is_device(path: Path) -> bool:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file. ValueError: no TOML, or larger than 1 MiB. OSError: it cannot be read."""
-    return tomllib.loads(read_small(path))
-
-
-def read_small(path: Path) -> str:
-    """The text of a file, without its byte order mark. ValueError: larger than 1 MiB. OSError: it cannot be read."""
-    with open(path, "rb") as file:
-        data = file.read(_SMALL + 1)  # a device may have no end
-    if len(data) > _SMALL:
-        raise ValueError("larger than 1 MiB")
-    return data.decode("utf-8-sig")
+    """Read a TOML file, with or without a byte order mark. ValueError: no TOML. OSError: it cannot be read."""
+    return tomllib.loads(path.read_text(encoding="utf-8-sig"))
 
 
 def temporary_beside(path: Path) -> Path:

@@ -18,13 +18,7 @@ def align(x: Array, like: Array) -> jax.Array:
 
 def choose(done: jax.Array, new: Any, old: Any) -> Any:
     """`new` if `done` [], else `old`: two trees of one structure, random keys included."""
-
-    def leaf(new: jax.Array, old: jax.Array) -> jax.Array:
-        if jnp.issubdtype(old.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(jnp.where(done, jax.random.key_data(new), jax.random.key_data(old)))
-        return jnp.where(done, new, old)
-
-    return jax.tree.map(leaf, new, old)
+    return jax.tree.map(lambda new, old: jnp.where(done, new, old), new, old)
 
 
 T = TypeVar("T")

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, drive
+from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, joint_torque
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.hand.description import Hand
@@ -46,7 +46,7 @@ class Motors:
 
         def torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
             target = delayed_target(substep, *delay)
-            torque = drive(hand.actuator, target, jnp.zeros_like(target), position, velocity)
+            torque = joint_torque(hand.actuator, target, 0.0, position, velocity)
             return apply_friction(hand.actuator, torque, velocity, self._inertia_rate)
 
         return torque
@@ -58,8 +58,8 @@ class Motors:
         it [J] is at its limit."""
         position, velocity = state.qpos[self._physics.joint_qpos], state.qvel[self._physics.joint_dof]
         target = delayed_target(jnp.asarray(self._substeps), *self._delay(hand, command))
-        arguments = hand.actuator, target, jnp.zeros_like(target), position, velocity
-        return drive(*arguments), at_limit(*arguments)
+        arguments = hand.actuator, target, 0.0, position, velocity
+        return joint_torque(*arguments), at_limit(*arguments)
 
     def _delay(self, hand: HandParams, command: JointCommand) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Latency [J] in sub-steps within this tick, and the targets [J] before and after it. A latency of more than a

@@ -36,7 +36,7 @@ class SensorSuite:
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
-        self.taxels = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, self.period)
+        self.taxels = TaxelArray(config.sensing.taxel, hand, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
         critic = dataclasses.replace(config.observation, leave_out=())  # it may always look
         self._views = {"actor": config.observation, "critic": critic}

@@ -7,15 +7,13 @@ boundary plus the way there.
 Shapes: n nodes along each axis. Units: m.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import correlate1d
 
 from dexsim.core.assets import cached_arrays
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import mesh as meshes
 
 NODES = 64
@@ -31,7 +29,6 @@ _TINY = 1e-20
 class Grid:
     """Distances on nodes. `scale` may differ per environment, the rest is shared."""
 
-    nodes: int = static()
     values: jax.Array  # [n, n^2, 8] mm: the corners of the cell that begins at each node; 8 MB at 64 nodes
     origin: jax.Array  # [3] m, the first node
     spacing: jax.Array  # [3] m
@@ -56,7 +53,6 @@ def from_distances(axes: list[np.ndarray], distance: np.ndarray) -> Grid:
     # No cell begins at an axis' last node: what is rolled there is never read.
     corners = np.stack([np.roll(lowered, -((x * nodes + y) * nodes + z)) for x, y, z in np.ndindex(2, 2, 2)], -1)
     return Grid(
-        nodes=nodes,
         values=jnp.asarray(corners.reshape(nodes, nodes * nodes, 8)),
         origin=jnp.asarray([a[0] for a in axes], jnp.float32),
         spacing=jnp.asarray([a[1] - a[0] for a in axes], jnp.float32),
@@ -66,7 +62,7 @@ def from_distances(axes: list[np.ndarray], distance: np.ndarray) -> Grid:
 
 def signed_distance(points: jax.Array, grid: Grid) -> jax.Array:
     """Distance [...] m at points [..., 3] in the object's frame: by components, so that XLA makes one kernel of it."""
-    n = grid.nodes
+    n = len(grid.values)
     step, start = grid.spacing * grid.scale, grid.origin * grid.scale
     # Without the barrier XLA would read and divide these few numbers anew for every point.
     step, rate, start = jax.lax.optimization_barrier((step, 1.0 / step, start))

@@ -7,22 +7,19 @@ A mesh is a `trimesh.Trimesh`, whose name is in its `metadata`. Shapes: V vertic
 float64.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
+from trimesh import Trimesh
 
 from dexsim.core.errors import AssetError
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold
@@ -51,8 +48,6 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
       AssetError: not readable, not finite, of no graspable size, open, non-manifold, with inconsistent or inward
         normals, or flat.
     """
-    import trimesh
-
     name = str(source) if isinstance(source, (str, Path)) else "mesh"
     try:
         given = trimesh.load(source, force="mesh", process=False) if name != "mesh" else source
@@ -84,8 +79,6 @@ def load_mesh(source: Any, *, scale: float = 1.0, repair: str = "none") -> Trime
 
 def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Trimesh:
     """A mesh of these arrays as they are, unchecked."""
-    import trimesh
-
     return trimesh.Trimesh(vertices, faces, process=False, metadata={"name": name})
 
 
@@ -102,8 +95,6 @@ def signed_distance(mesh: Trimesh, points: np.ndarray) -> np.ndarray:
     No triangle is farther away than the nearest corner, and none nearer than its bounding sphere: few are left to
     measure for each point.
     """
-    import trimesh
-
     corners, normals = np.asarray(mesh.triangles), np.asarray(mesh.face_normals)
     reach = cKDTree(corners.reshape(-1, 3)).query(points)[0]
     middle = (corners.min(1) + corners.max(1)) / 2
@@ -137,8 +128,6 @@ def check_sign(mesh: Trimesh, count: int = 20_000) -> None:
 
 def sample_surface(mesh: Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Random points [count, 3] m, uniform by area, with their face normals [count, 3]."""
-    import trimesh
-
     points, face = trimesh.sample.sample_surface(mesh, count, seed=rng)
     return np.asarray(points), np.asarray(mesh.face_normals)[face]
 
@@ -161,16 +150,12 @@ def _check_closed(mesh: Trimesh, size: float) -> None:
         raise AssetError(f"{name}: the surface is {what}{more} (ObjectConfig.mesh_repair closes it: shell or hull)")
     if not mesh.is_winding_consistent:
         raise AssetError(f"{name}: normals point both ways; trimesh.repair.fix_winding makes them agree")
-    volume = float(mesh.volume)
-    if abs(volume) < 1e-6 * size**3:
-        raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")
-    if volume < 0:
-        raise AssetError(f"{name}: normals point inward (volume {volume:.3g} m^3); turn it with mesh.invert()")
+    if mesh.volume < 1e-6 * size**3:
+        wrong = "it is flat, or its normals point inward: mesh.invert() turns it"
+        raise AssetError(f"{name}: encloses {mesh.volume:.3g} m^3 for a size of {size:.3g} m; {wrong}")
 
 
 def _hull(mesh: Trimesh) -> Trimesh:
-    import trimesh
-
     # Nearly coplanar corners would leave slits between a hull's triangles.
     used = mesh.vertices[mesh.faces.ravel()]
     grid = 1e-4 * np.ptp(used, axis=0).max()
@@ -180,8 +165,6 @@ def _hull(mesh: Trimesh) -> Trimesh:
 def _shell(mesh: Trimesh) -> Trimesh:
     """A closed surface round another one: all that cannot be reached from outside through gaps of less than two cells
     is inside. It is the boundary of cells, pulled to the surface."""
-    import trimesh
-
     points = _points_on(mesh)
     cell = np.ptp(points, axis=0).max() / _CELLS
     low = points.min(0) - 3 * cell

@@ -6,8 +6,6 @@ taxel touches where that is negative (paper, section Sim-to-Real Transfer).
 Shapes: N points. Units: m.
 """
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -11,21 +11,16 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.description import unit
-from dexsim.hand.vendor import Draft, Link
+from dexsim.hand.vendor import Direction, Draft, ImportOptions, Link
 
 _FLEXION = 0.7  # cosine to the axis of a finger's last joint above which another joint flexes, too
 _NAMES = ("index", "middle", "ring", "pinky", "sixth")
 _THUMB = re.compile(r"thumb|(^|[^a-z])th([^a-z]|[jmdpb]|$)", re.IGNORECASE)
-Direction = tuple[float, float, float]
 _SNAP = np.cos(np.radians(10.0))  # a frame this near to the file's axes is meant to be along them
 
 
-def orient(draft: Draft, *, thumb: str = "", along: Direction | None = None, normal: Direction | None = None) -> None:
+def orient(draft: Draft, options: ImportOptions) -> None:
     """Find fingers, palm frame, signs and side, and turn the links into them.
-
-    Args:
-      thumb: a link or joint of the thumb; empty to find it.
-      along, normal: [3] where the fingers point and the palm faces, in the file's axes; None to find them.
 
     Raises:
       AssetError: fewer than two fingers, or no side on which they close.
@@ -35,8 +30,8 @@ def orient(draft: Draft, *, thumb: str = "", along: Direction | None = None, nor
     chains = [_chain(links, at) for at in range(1, len(links)) if at not in parents]
     if not 2 <= len(chains) <= 6:
         raise AssetError(f"{draft.name}: expected 2 to 6 fingers, got {len(chains)}; see --palm BODY, --freeze JOINT")
-    first = chains.pop(_find_thumb(draft, chains, thumb))
-    rotation = _find_frame(links, chains, along, normal)
+    first = chains.pop(_find_thumb(draft, chains, options.thumb))
+    rotation = _find_frame(links, chains, options.fingers, options.normal)
     for link in links:
         link.axis, link.anchor, link.centre = (rotation @ vector for vector in (link.axis, link.anchor, link.centre))
         link.inertia = rotation @ link.inertia @ rotation.T

@@ -8,8 +8,6 @@ Taxel index = column * rows + row. Taxels are arrays [N, 7] in the link's frame:
 Units: m, m^2.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping

@@ -113,17 +113,13 @@ def read_mjcf(path: Path) -> bytes:
 
 def _paste_includes(element: ElementTree.Element, top: Path, folder: Path) -> None:
     """MuJoCo looks beside the model first, in `top`, then beside the file that includes, in `folder`."""
-    children = []
-    for child in list(element):
-        if child.tag != "include":
-            _paste_includes(child, top, folder)
-            children.append(child)
-            continue
-        file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
-        included = ElementTree.parse(file).getroot()
-        _paste_includes(included, top, file.parent)
-        children += included
-    element[:] = children
+    for parent in list(element.iter()):
+        for child in parent.findall("include"):
+            file = next(path for path in (top / child.attrib["file"], folder / child.attrib["file"]) if path.is_file())
+            included = ElementTree.parse(file).getroot()
+            _paste_includes(included, top, file.parent)
+            place = list(parent).index(child)
+            parent[place : place + 1] = included
 
 
 def digest_of(*files: Path) -> str:
@@ -171,8 +167,10 @@ def _load(path: Path, source: str) -> Hand:
     if not all(model.body(b).name for b in bodies):
         raise ConfigError(f"{table.model}: a body below {table.palm!r} has no name: every link needs one")
     row = {body: i for i, body in enumerate(bodies)}
-    at = _hinges_of_bodies(model, palm, row)
-    has = at >= 0
+    has = (model.body_jntnum[bodies] > 0) & (np.array(bodies) != palm)
+    at = np.where(has, model.body_jntadr[bodies], -1)
+    if other := set(range(model.njnt)) - set(at.tolist()):
+        raise ConfigError(f"joint {model.joint(min(other)).name!r} must be the only joint of a body below the palm")
     moved = {joint: (joint, 1.0, 0.0) for joint in joints} | followers | {-1: (-1, 1.0, 0.0)}
     body_motor, body_ratio, body_offset = zip(*(moved[hinge] for hinge in at), strict=True)
     tips = _find_tips(model, table, row)
@@ -297,16 +295,6 @@ def _check_joints(model: Any, table: HandFile, joints: list[int], followers: int
             if not low - _SLACK <= angle <= high + _SLACK:
                 span = f"{low:.4g} to {high:.4g} rad"
                 raise ConfigError(f"posture: {angle:g} rad of {name!r} is outside of its range in the MJCF, {span}")
-
-
-def _hinges_of_bodies(model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
-    """The model's joint [B] that moves each body; -1 for none."""
-    hinges = np.full(len(row), -1)
-    for joint, body in enumerate(model.jnt_bodyid.tolist()):
-        if body not in row or body == palm or hinges[row[body]] >= 0:
-            raise ConfigError(f"joint {model.joint(joint).name!r} must be the only joint of a body below the palm")
-        hinges[row[body]] = joint
-    return hinges
 
 
 def _find_tips(model: Any, table: HandFile, row: dict[int, int]) -> list[int]:

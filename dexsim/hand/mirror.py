@@ -56,19 +56,16 @@ def mirror_hand(hand: Hand) -> Hand:
         dataclasses.replace(geom, position=geom.position * POLAR, rotation=geom.rotation * MATRIX)
         for geom in hand.geoms
     )
+    polar = ("body_position", "joint_anchor", "tip_offset", "taxel_position", "taxel_normal")
     return dataclasses.replace(
         hand,
         side=OTHER[hand.side],
-        body_position=hand.body_position * POLAR,
         body_rotation=hand.body_rotation * MATRIX,
         joint_axis=np.where(hand.body_joint[:, None] >= 0, hand.joint_axis * AXIAL, hand.joint_axis),
-        joint_anchor=hand.joint_anchor * POLAR,
-        tip_offset=hand.tip_offset * POLAR,
-        taxel_position=hand.taxel_position * POLAR,
-        taxel_normal=hand.taxel_normal * POLAR,
         geoms=geoms,
         grasp_centre=mirror_point(hand.grasp_centre),
         rotate_reference=mirror_point(hand.rotate_reference),
+        **{name: getattr(hand, name) * POLAR for name in polar},
     )
 
 
@@ -90,12 +87,8 @@ def is_mirror_image(hand: Hand, other: Hand) -> bool:
 
 def swap_sides(text: str) -> str:
     """A text with its words right and left exchanged; "_" and digits end a word."""
-
-    def other(word: re.Match) -> str:
-        swapped = OTHER[word[0].lower()]
-        return swapped.upper() if word[0].isupper() else swapped.title() if word[0][0].isupper() else swapped
-
-    return re.sub(r"(?<![a-z])(right|left)(?![a-z])", other, text, flags=re.IGNORECASE)
+    words = {style(one): style(two) for one, two in OTHER.items() for style in (str.lower, str.title, str.upper)}
+    return re.sub("[a-zA-Z]+", lambda word: words.get(word[0], word[0]), text)
 
 
 def mirror_toml(text: str, stem: str) -> str:

@@ -13,7 +13,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
 
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, primitive_mesh
 from dexsim.hand.fit import Capsule, PalmBox
@@ -25,6 +27,33 @@ _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
 _LARGEST = 2.0  # m, of a link: none of a hand is so large
+
+
+Direction = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImportOptions(Config):
+    """What a file does not say, or what is to be read otherwise."""
+
+    palm: str = ""
+    """Body of the palm; empty for the one where all fingers begin."""
+    thumb: str = ""
+    """A link or joint of the thumb; empty to find it."""
+    fingers: Direction | None = None
+    """Direction in the file's axes in which the fingers point, as 0 0 1; None to find it."""
+    normal: Direction | None = None
+    """Direction in the file's axes that the palm faces; None to find it."""
+    freeze: tuple[str, ...] = ()
+    """Joints to fix at 0. Joints above the palm are fixed anyway."""
+    couple: tuple[str, ...] = ()
+    """FOLLOWER=LEADER:RATIO: a joint that follows another by a tendon."""
+    drop_tendons: bool = False
+    """Leave tendons out; see --couple."""
+    torque: float = setting(0.0, unit="Nm", low=0.0, high=100.0)
+    """Stall torque of all motors; 0 for the file's."""
+    speed: float = setting(0.0, unit="rad/s", low=0.0, high=1000.0)
+    """No-load speed of all motors; 0 for the file's."""
 
 
 @dataclasses.dataclass(eq=False, kw_only=True)
@@ -76,16 +105,8 @@ class Draft:
         return [self.links[at] for at in order if self.links[at].is_motor]
 
 
-def read_hand(
-    path: Path, *, palm: str = "", freeze: Sequence[str] = (), couple: Sequence[str] = (), drop_tendons: bool = False
-) -> Draft:
+def read_hand(path: Path, options: ImportOptions) -> Draft:
     """Read a hand from a URDF or MJCF.
-
-    Args:
-      palm: its body; empty for the one where all fingers begin.
-      freeze: joints that are to be fixed at 0.
-      couple: FOLLOWER=LEADER:RATIO of joints that a tendon couples.
-      drop_tendons: leave tendons out.
 
     Raises:
       AssetError: not readable, not a hand, or something that a hand's folder cannot hold.
@@ -97,11 +118,11 @@ def read_hand(
             raise ConfigError(f"expected <robot> (URDF) or <mujoco> (MJCF), got <{root.tag}>; expand a xacro first")
         spec = _read_urdf(path, root, notes) if root.tag == "robot" else _read_mjcf(path, notes)
         if spec.tendons:
-            _drop_tendons(spec, drop_tendons)
+            _drop_tendons(spec, options.drop_tendons)
         # Velocity limits, which MuJoCo does not read.
         limits = [(joint.get("name", ""), limit) for joint in root.findall("joint") for limit in joint.findall("limit")]
         speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits}
-        links = _read_links(spec.compile(), palm, freeze, couple, speeds, notes)
+        links = _read_links(spec.compile(), options, speeds, notes)
         for link in links:
             if link.surface is not None and np.max(link.surface.extents) > _LARGEST:
                 long = f"link {link.name} is {np.max(link.surface.extents):.0f} m long"
@@ -148,8 +169,6 @@ def _read_urdf(path: Path, root: ElementTree.Element, notes: list[str]) -> mujoc
 
 def _embed_mesh(path: Path, element: ElementTree.Element, assets: dict[str, bytes], notes: list[str]) -> bool:
     """Put the mesh of a visual or collision element, if it has one, into `assets`; whether the element has a shape."""
-    import trimesh
-
     shape = element.find("geometry/mesh")
     if shape is None:
         return element.find("geometry/*") is not None
@@ -212,15 +231,12 @@ def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
             bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
             raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
         return at
-    fingers: list[list[int]] = []
-    for body in sorted({int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}):
-        chain = [body]
-        while chain[-1]:
-            chain.append(int(model.body_parentid[chain[-1]]))
-        fingers = [other for other in fingers if other[0] not in chain] + [chain]  # parents come before children
-    if len(fingers) < 2:
-        raise ConfigError(f"expected a hand of two fingers or more, got {len(fingers)} chains of hinges")
-    return next(body for body in fingers[0] if all(body in chain for chain in fingers))
+    parents, moving = model.body_parentid, {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
+    tips = [body for body in moving if not any(is_below(parents, other, body) for other in moving - {body})]
+    if len(tips) < 2:
+        raise ConfigError(f"expected a hand of two fingers or more, got {len(tips)} chains of hinges")
+    # Parents come before children.
+    return max(body for body in range(model.nbody) if all(is_below(parents, tip, body) for tip in tips))
 
 
 def _read_followers(
@@ -266,26 +282,21 @@ def _stall_torques(model: mujoco.MjModel) -> dict[int, float]:
 
 
 def _read_links(
-    model: mujoco.MjModel,
-    palm_name: str,
-    freeze: Sequence[str],
-    couple: Sequence[str],
-    speeds: dict[str, float],
-    notes: list[str],
+    model: mujoco.MjModel, options: ImportOptions, speeds: dict[str, float], notes: list[str]
 ) -> list[Link]:
     """The palm and a link for each hinge below it that is not frozen; of two hinges on one body the first moves a link
     without a shape."""
-    names = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)]
+    names, freeze = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)], options.freeze
     if unknown := set(freeze) - set(names):
         raise ConfigError(f"--freeze {sorted(unknown)[0]}: no such joint; it has {', '.join(names)}")
-    palm = _find_palm(model, palm_name, {j for j, joint in enumerate(names) if joint in freeze})
+    palm = _find_palm(model, options.palm, {j for j, joint in enumerate(names) if joint in freeze})
     below = [b for b in range(model.nbody) if b != palm and is_below(model.body_parentid, b, palm)]
     joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in below and names[j] not in freeze]
     if frozen := [name for j, name in enumerate(names) if j not in joints]:
         notes.append(f"frozen at 0  {', '.join(frozen)}: above the palm, or by --freeze")
     if other := [names[j] for j in joints if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]:
         raise ConfigError(f"joint {other[0]!r} is not a hinge: --freeze {other[0]} fixes it at 0")
-    followers, torques = _read_followers(model, names, joints, couple, notes), _stall_torques(model)
+    followers, torques = _read_followers(model, names, joints, options.couple, notes), _stall_torques(model)
     data = _pose_in_palm_frame(model, palm)
     last = {int(model.jnt_bodyid[j]): j for j in joints}  # of each body that moves
     links, row = [Link(parent=-1, **_read_body(model, data, palm, last))], {palm: 0}
@@ -335,8 +346,6 @@ def _pose_in_palm_frame(model: mujoco.MjModel, palm: int) -> mujoco.MjData:
 
 def _read_body(model: mujoco.MjModel, data: mujoco.MjData, body: int, moving: Collection[int]) -> dict[str, Any]:
     """Name, mass and surface of a body with all that is fixed to it: fields of `Link`."""
-    import trimesh
-
     members = [body]
     for other in range(body + 1, model.nbody):
         if int(model.body_parentid[other]) in members and other not in moving:
@@ -357,8 +366,6 @@ def _read_body(model: mujoco.MjModel, data: mujoco.MjData, body: int, moving: Co
 
 def _read_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[Any]:
     """The shapes of a body: its meshes, or else its primitives."""
-    import trimesh
-
     geoms = np.flatnonzero(model.geom_bodyid == body)
     meshes = geoms[model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH]
     shapes = []

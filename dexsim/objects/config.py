@@ -25,7 +25,6 @@ KINDS = (*SHAPES, "mesh")
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
 PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
 """Ranges of `ObjectConfig` that are drawn anew at every episode start, in the order of their random keys."""
-SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

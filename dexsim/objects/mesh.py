@@ -9,8 +9,6 @@ another inside the voxels of the mesh, each where it covers most that is not cov
 sized together so that the distance to their union is the distance to the mesh near its surface.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
@@ -18,6 +16,7 @@ from functools import lru_cache
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 from scipy.optimize import linear_sum_assignment, minimize
 
 from dexsim.core.assets import cached_arrays
@@ -214,8 +213,6 @@ def _refine(start: np.ndarray, points: np.ndarray, distance: np.ndarray, extent:
 
 def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> Boxes:
     """Boxes from [K, 10], with their deviation."""
-    import trimesh
-
     position, size, quat = np.split(fit.astype(np.float32), [3, 6], axis=1)
     boxes = Boxes(np.exp(size), position, quat / np.linalg.norm(quat, axis=1, keepdims=True), np.zeros(2))
     shape = boxes.shape()

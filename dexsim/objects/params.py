@@ -15,16 +15,9 @@ import numpy as np
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
-from dexsim.objects.config import (
-    INACTIVE_SIZE,
-    KINDS,
-    PROPERTY_RANGES,
-    SHAPES,
-    SLOTS,
-    SPHERE_HALF_LENGTH,
-    ObjectConfig,
-    load_mesh_object,
-)
+from dexsim.objects.config import INACTIVE_SIZE, KINDS, PROPERTY_RANGES, SHAPES, SLOTS, ObjectConfig, load_mesh_object
+
+_SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
 @pytree_dataclass
@@ -66,12 +59,8 @@ def bounding_radius(size: jax.Array, kinds: tuple[str, ...]) -> jax.Array:
 
 def extent(object: ObjectParams, direction: jax.Array) -> jax.Array:
     """How far [] m the object reaches along a unit `direction` [3] of its own frame."""
-    reaches = []
-    for k, kind in enumerate(object.kinds):
-        local = direction
-        if object.quat is not None:
-            local = rotations.rotate_inverse(rotations.quat_to_matrix(object.quat[k]), direction)
-        along, (a, b, c) = jnp.abs(local), object.size[k]
+    reaches, local = [], jnp.abs(rotations.rotate_inverse(object.shape().rotation, direction[None]))
+    for along, kind, (a, b, c) in zip(local, object.kinds, object.size, strict=True):
         reach_of = {
             "box": along[0] * a + along[1] * b + along[2] * c,
             "capsule": a + b * along[2],
@@ -231,7 +220,7 @@ def _sample_slots(
     body_half = jnp.where(box_body, half[2], length)
     capsule = jnp.where(
         is_sphere,
-        jnp.stack([ball, SPHERE_HALF_LENGTH]),
+        jnp.stack([ball, _SPHERE_HALF_LENGTH]),
         jnp.where(is_union, jnp.stack([neck, neck_half]), jnp.stack([radius, length])),
     )
     zero = jnp.zeros(())

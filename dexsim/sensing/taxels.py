@@ -1,6 +1,6 @@
 """What a taxel array does to the force before the host reads it: `TaxelSensor` configures it, `TaxelArray` does it.
 
-    array = TaxelArray(TaxelSensor(gain=(0.85, 1.15)), (10, 12), fingers=5, control_period=0.03)
+    array = TaxelArray(TaxelSensor(gain=(0.85, 1.15)), hand, control_period=0.03)
     params = array.sample(key)                                   # once an episode
     memory = array.init()
     memory, reading = array.apply(params, memory, key, force)    # every control tick, [F, N] N
@@ -12,8 +12,6 @@ the converter, and its own sampling rate. Effects with a range are off by defaul
 Shapes: F fingers, N taxels a finger.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax
@@ -21,6 +19,7 @@ import jax.numpy as jnp
 
 from dexsim.core.config import Config, Range, setting
 from dexsim.core.ranges import uniform
+from dexsim.hand.description import Hand
 
 DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 """Effects that are drawn at every episode start where they have a range."""
@@ -71,21 +70,15 @@ held (the last sample) [F, N] N; clock [], periods since that sample, below 0 be
 
 @dataclasses.dataclass(frozen=True)
 class TaxelArray:
-    """A `TaxelSensor` on a lattice, read at one control rate. Pure functions, for one environment; `vmap` them."""
+    """A `TaxelSensor` on a hand, read at one control rate. Pure functions, for one environment; `vmap` them."""
 
     sensor: TaxelSensor
-    grid: tuple[int, int]  # columns, rows
-    fingers: int
+    hand: Hand
     control_period: float  # s
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(F, N)."""
-        return self.fingers, self.grid[0] * self.grid[1]
 
     def sample(self, key: jax.Array, scale: jax.Array | float = 1.0) -> TaxelParams:
         """Draw one episode's array; `scale` [] in [0, 1] is the width of all ranges about a perfect one."""
-        sensor, each, finger = self.sensor, self.shape, (self.fingers, 1)
+        sensor, each, finger = self.sensor, self.hand.taxel_area.shape, (self.hand.num_fingers, 1)
         keys = dict(zip((*DRAWN, "time", "alive", "phase"), jax.random.split(key, len(DRAWN) + 3), strict=True))
         params: TaxelParams = {}
         for name in DRAWN[:-1]:
@@ -106,7 +99,7 @@ class TaxelArray:
 
     def init(self) -> TaxelMemory:
         """Before the first tick: nothing felt, nothing drifted."""
-        sensor, nothing = self.sensor, jnp.zeros(self.shape)
+        sensor, nothing = self.sensor, jnp.zeros(self.hand.taxel_area.shape)
         memory = {"late": sensor.hysteresis, "walk": sensor.drift, "held": sensor.rate}
         clock = {} if sensor.rate is None else {"clock": jnp.full((), -1.0)}
         return {name: nothing for name, effect in memory.items() if effect is not None} | clock
@@ -126,13 +119,13 @@ class TaxelArray:
             memory["late"] = load + params["memory"] * (memory["late"] - load)
             value = value + params["hysteresis"] * (memory["late"] - load)
         if "crosstalk" in params:
-            value = value + params["crosstalk"] / 4 * neighbour_difference(value, self.grid)
+            value = value + params["crosstalk"] / 4 * neighbour_difference(value, self.hand.taxel_grid)
         if "gain" in params:
             value = value * params["gain"]
         if "bias" in params:
             value = value + params["bias"]
         if "walk" in memory:
-            memory["walk"] += params["drift"] * jax.random.normal(jax.random.fold_in(key, 2), self.shape)
+            memory["walk"] += params["drift"] * jax.random.normal(jax.random.fold_in(key, 2), force.shape)
             value = value + memory["walk"]
         value = value + sensor.noise * jax.random.normal(key, force.shape)
         if "alive" in params:

@@ -39,9 +39,8 @@ def bad_meshes():
     return {
         "open": (vertices, faces[:-1]),
         "non-manifold: 1 edges have more than two": touching,
-        "inward": turned(box.copy()),
+        "encloses -.* inward": turned(box.copy()),
         "both ways": (vertices, mixed),
-        "no volume": box.copy().apply_scale([1, 1, 1e-9]),
         "scale=0.001": (1000 * vertices, faces),
         "6e-05 m across": (1e-3 * vertices, faces),
         "nowhere.stl": "nowhere.stl",
@@ -91,7 +90,6 @@ def test_values_are_scipys_interpolation():
     corners = [np.roll(cube.reshape(-1), -((x * n + y) * n + z)) for x, y, z in np.ndindex(2, 2, 2)]
     origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
     baked = grid.Grid(
-        nodes=n,
         values=jnp.asarray(np.stack(corners, -1).reshape(n, n * n, 8)),
         origin=jnp.asarray(origin, jnp.float32),
         spacing=jnp.asarray(step, jnp.float32),

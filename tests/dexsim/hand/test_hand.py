@@ -43,7 +43,7 @@ def test_a_fingertips_strength_takes_one_joint_to_its_stall_torque(hand):
     data, joints = mujoco.MjData(model), [model.joint(joint) for joint in hand.joint_names]
     data.qpos[[joint.qposadr[0] for joint in joints]] = hand.grasp_posture
     mujoco.mj_fwdPosition(model, data)
-    for finger, force in enumerate(fingertip_strength(hand, np.asarray(hand.grasp_posture, np.float32))):
+    for finger, force in enumerate(fingertip_strength(hand, np.asarray(hand.grasp_posture))):
         body = model.body(hand.body_names[hand.tip_body[finger]]).id
         frame = data.xmat[body].reshape(3, 3)
         normal = frame @ hand.taxel_normal[finger].mean(0)

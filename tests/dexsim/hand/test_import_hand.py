@@ -15,7 +15,7 @@ from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.posture import find_grasp
-from dexsim.hand.vendor import read_hand
+from dexsim.hand.vendor import ImportOptions, read_hand
 from dexsim.randomization import Randomization, sample_hand
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
@@ -23,6 +23,7 @@ from dexsim.tasks.grasp.task import Grasp
 TURN = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()  # of the file's palm against ours
 ROOTS = {"index": (0, 0.035, 0.09), "middle": (0, 0.01, 0.095), "ring": (0, -0.015, 0.09), "thumb": (0.01, 0.05, 0.02)}
 LENGTHS = (0.04, 0.03)
+PLAIN = ImportOptions()
 
 
 def urdf(folder, *, reverse=(), turn=TURN, effort="0.6", mirror=False):
@@ -81,9 +82,9 @@ def vector(values):
 
 
 def draft_of(path):
-    draft = read_hand(path)
-    orient(draft)
-    import_hand.fit_links(draft)
+    draft = read_hand(path, PLAIN)
+    orient(draft, PLAIN)
+    import_hand.fit_links(draft, PLAIN)
     return draft
 
 
@@ -148,7 +149,7 @@ def test_the_whole_command(tmp_path, capsys):
     np.testing.assert_allclose(sorted(set(hand.body_ratio.round(5))), [0.8, 1.0])
     # What the thumb can oppose, and gains in proportion to stall torques.
     low, high = Grasp(GraspConfig(), hand).finger_force
-    thumb, *others = fingertip_strength(hand, np.float32(hand.grasp_posture))
+    thumb, *others = fingertip_strength(hand, np.array(hand.grasp_posture))
     assert low == pytest.approx(max(high / 4, 1.0), abs=1e-3)
     assert high == pytest.approx(min(thumb / 2.75, *others), abs=1e-3)
     nominal = sample_hand(jax.random.key(0), Randomization(scale=0), hand, timestep=0.01, control_period=0.03)
@@ -174,7 +175,8 @@ def mjcf(folder, tail="", bodies=("thumb", "f", "g")):
 
 def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
     path = mjcf(tmp_path, TENDON + '<equality><tendon tendon1="cord"/></equality>')
-    (follower,) = (link for link in read_hand(path, drop_tendons=True, couple=("f_b=f_a:0.7",)).links if link.leader)
+    options = ImportOptions(drop_tendons=True, couple=("f_b=f_a:0.7",))
+    (follower,) = (link for link in read_hand(path, options).links if link.leader)
     assert (follower.joint, follower.leader, follower.ratio) == ("f_b", "f_a", 0.7)
 
 
@@ -191,26 +193,27 @@ REFUSED = {
 def test_what_cannot_be_imported_is_one_line(tmp_path, what):
     file, options, says = REFUSED[what]
     with pytest.raises(AssetError, match=says):
-        read_hand(mjcf(tmp_path, **file), **options)
+        read_hand(mjcf(tmp_path, **file), ImportOptions(**options))
 
 
 def test_the_frame_is_confirmed(tmp_path):
     with pytest.raises(ConfigError, match="not a terminal: --yes accepts"):
         import_hand.main([str(mjcf(tmp_path)), "--out", str(tmp_path)])
-    draft = read_hand(mjcf(tmp_path))
-    orient(draft, along=(0, 0, 2), normal=(-1, 0, 0.1))
+    options = ImportOptions(fingers=(0, 0, 2), normal=(-1, 0, 0.1))
+    draft = read_hand(mjcf(tmp_path), options)
+    orient(draft, options)
     (link,) = (link for link in draft.links if link.joint == "f_a")
     assert draft.side == "left" and abs(link.axis[1]) == 1 and link.anchor[2] == 0.05
 
 
-@pytest.mark.parametrize("given", [{}, {"along": (0, 0, 1), "normal": (0, 0, 1)}])
+@pytest.mark.parametrize("given", [{}, {"fingers": (0, 0, 1), "normal": (0, 0, 1)}])
 def test_joints_without_a_range_are_named_and_show_no_palm_side(tmp_path, given):
     path = mjcf(tmp_path)
     path.write_text(path.read_text().replace(' range="0 1.5"', ""))
-    draft = read_hand(path)
+    draft = read_hand(path, PLAIN)
     assert sum("no range in the file" in line for line in draft.findings) == 6
     with pytest.raises(AssetError, match="no palm side found"):
-        orient(draft, **given)
+        orient(draft, ImportOptions(**given))
 
 
 def test_meshes_in_millimetres_are_an_error(tmp_path):
@@ -218,7 +221,7 @@ def test_meshes_in_millimetres_are_an_error(tmp_path):
     for file in tmp_path.glob("meshes/*.stl"):
         trimesh.load(file).apply_scale(1000.0).export(file)
     with pytest.raises(AssetError, match='m long: meshes in millimetres need scale="0.001'):
-        read_hand(path)
+        read_hand(path, PLAIN)
 
 
 def test_a_hand_that_is_there_is_not_replaced(tmp_path):

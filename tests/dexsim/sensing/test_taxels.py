@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dexsim.hand.load import load_hand
 from dexsim.sensing.taxels import TaxelArray, TaxelSensor, neighbour_difference
 
-GRID, FINGERS, PERIOD = (10, 12), 5, 0.02
-SHAPE = (FINGERS, GRID[0] * GRID[1])
+HAND, PERIOD = load_hand(), 0.02
+GRID, SHAPE = HAND.taxel_grid, HAND.taxel_area.shape
 KEY = jax.random.key(0)
 IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
 BASE = 5.0  # N on every taxel, so that errors of both signs are read
 
 
 def model(**effects):
-    return TaxelArray(dataclasses.replace(IDEAL, **effects), GRID, FINGERS, PERIOD)
+    return TaxelArray(dataclasses.replace(IDEAL, **effects), HAND, PERIOD)
 
 
 def forces(seed=0):
@@ -75,7 +76,7 @@ def test_hysteresis_is_an_exponential_creep_to_the_force_times_the_fingers_gain(
 def test_crosstalk_by_loops_and_keeps_the_total():
     sensor = model(crosstalk=(0.2, 0.2))
     force = forces()
-    map_ = force.reshape(FINGERS, *GRID)
+    map_ = force.reshape(-1, *GRID)
     wanted = map_.copy()
     for column in range(GRID[0]):
         for row in range(GRID[1]):

@@ -49,7 +49,7 @@ def test_distances_agree_with_mujoco(part):
 def test_faces_lie_in_the_frame_of_the_object_as_in_training(task):
     """The policy sees this frame: cubes that stood otherwise in it did not turn."""
     trained = sample_turned_object(jax.random.key(0), TASKS[task].config())
-    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(trained.kinds), 1)) if trained.quat is None else trained.quat
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(trained.kinds), 1)) if trained.quat is None else np.asarray(trained.quat)
     axis, parameters = start_of(load_hand(), task).axis, sample_trial(task, np.random.default_rng(0))
     for k in range(10):
         (part,) = shapes.sample_shape(parameters, np.random.default_rng(k), None, axis).parts
