@@ -93,10 +93,10 @@ class Guard:
         """Raises HandError: the process has ended, or is suspended."""
         if self._process.poll() is not None:
             raise HandError("the guard process has ended")
-        if self._armed and self._answered(0.0):  # `arm` waits for the first answer.
-            self._asked = None
         late = self._asked is not None and time.monotonic() - self._asked > _ANSWER
-        if late and not self._answered(_MOMENT):
+        if self._armed and self._answered(_MOMENT if late else 0.0):  # `arm` waits for the first answer.
+            self._asked = None
+        elif late:
             raise HandError("the guard process does not respond; start the run again")
 
     def dismiss(self, off: bool) -> None:

@@ -24,9 +24,10 @@ class SimplePhysics:
     def tip_stiffness(self, object, pose, position, rotation, skin_force, pad_thickness_delta=0.0):
         return jnp.ones(5)
 
-    def advance(self, law, object, state, push, tip_stiffness=None, pad_thickness_delta=0.0, held=None):
-        del tip_stiffness, pad_thickness_delta  # nothing touches anything
+    def fields(self, object, tip_stiffness, pad_thickness_delta):
+        return object  # nothing touches anything
 
+    def advance(self, law, object, state, push, held=None):
         def substep(carry, index):
             qpos, qvel = carry
             tau = law(index, qpos[:12], qvel[:12])

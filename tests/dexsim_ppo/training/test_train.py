@@ -24,6 +24,7 @@ from dexsim_ppo.training.runlog import RunFolder, policy_of, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
 
 QUICK = [*tiny_train.QUICK, *"--evaluate-every 4 --evaluation-share 1 --log-every 2 --checkpoint-every 3".split()]
+QUICK += "--curriculum.on --curriculum.widen-above 0 --curriculum.narrow-below 0".split()
 
 
 pytestmark = pytest.mark.usefixtures("tiny_task")
@@ -42,6 +43,7 @@ def test_a_run_leaves_its_files(finished):
     assert [row["iteration"] for row in rows] == [1, 2, 4, 6], "the first, and every second"
     assert rows[-1]["env_steps"] == 6 * PER_ITERATION and rows[-1]["seconds"] > rows[0]["seconds"] > 0
     assert [row.get("evaluation/return") is not None for row in rows] == [False, False, True, False]
+    assert rows[-1]["curriculum/scale"] > rows[0]["curriculum/scale"]
     assert [path.name for path in finished.existing_checkpoints()] == ["00000003.msgpack", "00000006.msgpack"]
     assert [load_policy(policy_of(path)).training["iteration"] for path in finished.existing_checkpoints()] == [3, 6]
     config = json.loads(finished.config.read_text())
