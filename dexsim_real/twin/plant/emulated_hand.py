@@ -37,7 +37,7 @@ from dexsim_real.twin.plant.parameters import (
     skill_of,
     start_of,
 )
-from dexsim_real.twin.plant.referee import Look, Referee
+from dexsim_real.twin.plant.referee import ON_PALM, Look, Referee
 from dexsim_real.twin.plant.scene import Scene, TipContact, build_scene, palm_face, tip_contacts, tip_forces
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
@@ -52,6 +52,7 @@ _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start postur
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
 _OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
 _STEP, _STEPS = 0.001, 20  # m, and how many an object is moved down or up where fingers carry it
+_SINK, _SPRING = 0.3, (3.0, 0.05)  # s, and Nm/rad and Nm s/rad of the fingers, for an object to come to rest on them
 _SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the release position
 
 
@@ -428,8 +429,25 @@ def find_place(
             down = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
             position = np.array([face + gap + shape.reach(down), *(start.place + shift)])
         if position is not None and is_clear(scene, data, position, quat):
-            return Place(position, quat, np.array([speed, 0.0, 0.0]))
+            place = Place(position, quat, np.array([speed, 0.0, 0.0]))
+            if not start.clear or rests_on_fingers(scene, place, shape, face, start):
+                return place
     return None
+
+
+def rests_on_fingers(scene: Scene, place: Place, shape: ObjectShape, face: float, start: Start) -> bool:
+    """Whether an object that is let go stays on the fingers, which keep their posture, as all starts of training do:
+    of one that sinks onto the palm no policy has ever moved a finger."""
+    data, at = mujoco.MjData(scene.model), scene.object_qpos
+    scene.set_joints(data, start.posture)
+    put(scene, data, place.position, place.quat)
+    for _ in range(round(_SINK / scene.model.opt.timestep)):
+        off, speed = start.posture - data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
+        data.qfrc_applied[scene.drive_dof] = _SPRING[0] * off - _SPRING[1] * speed
+        mujoco.mj_step(scene.model, data)
+        if data.qpos[at] - shape.reach(matrix(data.qpos[at + 3 : at + 7]).T @ [-1.0, 0.0, 0.0]) - face < ON_PALM:
+            return False
+    return True
 
 
 def lower(scene: Scene, data: mujoco.MjData, place: np.ndarray, quat: np.ndarray) -> np.ndarray | None:
