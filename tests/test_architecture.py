@@ -61,18 +61,19 @@ FLOORS = {
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 14_500,  # goal: 12,500
-    "dexsim/core": 855,  # goal: 900
-    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_260,  # goal: 1,900
-    "dexsim/hand dexsim/objects": 2_625,  # goal: 1,900
-    "dexsim/physics": 2_330,  # goal: 2,200, and 1,300 of CUDA
-    "dexsim/env dexsim/tasks": 2_500,  # goal, with the roots: 3,200
-    ROOTS: 1_460,
-    "dexsim/calibration dexsim/identification": 1_435,  # goal: 1,500
-    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_050,  # goal: 1,900
-    "dexsim_ppo": 3_860,  # goal: 4,000
-    "dexsim_real": 8_555,  # goal: 6,500
-    "benchmarks": 2_095,
+    "dexsim dexsim_ppo dexsim_real benchmarks": 28_495,  # goal: 25,000
+    "dexsim": 14_225,  # goal: 12,500
+    "dexsim/core": 820,  # goal: 900
+    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 1_225,  # goal: 1,900
+    "dexsim/hand dexsim/objects": 2_585,  # goal: 1,900
+    "dexsim/physics": 2_305,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/env dexsim/tasks": 2_470,  # goal, with the roots: 3,200
+    ROOTS: 1_395,
+    "dexsim/calibration dexsim/identification": 1_425,  # goal: 1,500
+    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_015,  # goal: 1,900
+    "dexsim_ppo": 3_805,  # goal: 4,000
+    "dexsim_real": 8_440,  # goal: 6,500
+    "benchmarks": 2_030,
     "tests": 17_995,  # goal: 18,000
 }
 """Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
