@@ -58,8 +58,8 @@ def films() -> None:
 
 
 def episodes() -> None:
-    """What `dexsim demo` shows where there is no JAX; that of rotate_clear, whose policy is as it was, is kept: its first
-    starts of this seed fall at once."""
+    """What `dexsim demo` shows where there is no JAX. Those of rotate_clear are kept, as its policy is: the first starts
+    of this seed fall at once."""
     for name, count in {"grasp": 4, "rotate": 2, "rotate_without_orientation": 2}.items():
         file = ROOT / "assets" / "episodes" / f"{name}.npz"
         record.main([name, "--npz", str(file), "--episodes", str(count)])
