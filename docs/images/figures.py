@@ -58,7 +58,7 @@ def films() -> None:
 
 
 def episodes() -> None:
-    """What `dexsim demo` shows where there is no JAX. Those of rotate_clear are kept, as its policy is: the first starts
+    """What `dexsim demo` shows where there is no JAX. Those of rotate_clear are kept: the first two starts
     of this seed fall at once."""
     for name, count in {"grasp": 4, "rotate": 2, "rotate_without_orientation": 2}.items():
         file = ROOT / "assets" / "episodes" / f"{name}.npz"
