@@ -27,8 +27,6 @@ _NO_MASS = 2e-6  # kg; a URDF's links without a mass are read with half of it
 _NO_INERTIA = 1e-13  # kg m^2, below which MuJoCo takes it for none
 _LEAST_INERTIA = 1e-7  # kg m^2
 _LARGEST = 2.0  # m, of a link: none of a hand is so large
-
-
 Direction = tuple[float, float, float]
 
 

@@ -314,7 +314,7 @@ class EmulatedHand:
             position=data.qpos[at : at + 3].copy(),
             quat=quat,
             velocity=matrix(quat) @ data.qvel[dof + 3 : dof + 6],
-            height=float(data.qpos[at]) - self.shape.reach(matrix(quat).T @ [-1.0, 0.0, 0.0]) - self._palm_face,
+            height=float(data.qpos[at]) - self.shape.below(quat) - self._palm_face,
             force=np.linalg.norm(force, axis=-1),
             normal=normal,
             taxels=self._samples[-1][1][..., 2].sum(-1),
@@ -426,8 +426,7 @@ def find_place(
         if start.clear:
             position = lower(scene, data, start.place + (0.0, *shift), quat)
         else:
-            down = matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-            position = np.array([face + gap + shape.reach(down), *(start.place + shift)])
+            position = np.array([face + gap + shape.below(quat), *(start.place + shift)])
         if position is not None and is_clear(scene, data, position, quat):
             place = Place(position, quat, np.array([speed, 0.0, 0.0]))
             if not start.clear or rests_on_fingers(scene, place, shape, face, start):
@@ -436,8 +435,7 @@ def find_place(
 
 
 def rests_on_fingers(scene: Scene, place: Place, shape: ObjectShape, face: float, start: Start) -> bool:
-    """Whether an object that is let go stays on the fingers, which keep their posture, as all starts of training do:
-    of one that sinks onto the palm no policy has ever moved a finger."""
+    """Whether an object that is let go stays off the palm, as in training, while the fingers keep their posture."""
     data, at = mujoco.MjData(scene.model), scene.object_qpos
     scene.set_joints(data, start.posture)
     put(scene, data, place.position, place.quat)
@@ -445,7 +443,7 @@ def rests_on_fingers(scene: Scene, place: Place, shape: ObjectShape, face: float
         off, speed = start.posture - data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
         data.qfrc_applied[scene.drive_dof] = _SPRING[0] * off - _SPRING[1] * speed
         mujoco.mj_step(scene.model, data)
-        if data.qpos[at] - shape.reach(matrix(data.qpos[at + 3 : at + 7]).T @ [-1.0, 0.0, 0.0]) - face < ON_PALM:
+        if data.qpos[at] - shape.below(data.qpos[at + 3 : at + 7]) - face < ON_PALM:
             return False
     return True
 

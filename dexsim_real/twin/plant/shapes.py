@@ -64,6 +64,10 @@ class ObjectShape:
         """As `Primitive.reach`."""
         return max(part.reach(direction) for part in self.parts)
 
+    def below(self, quat: np.ndarray) -> float:
+        """Extent in m from the object's origin toward the palm, at an orientation [4]."""
+        return self.reach(matrix(quat).T @ [-1.0, 0.0, 0.0])
+
 
 def sample_shape(
     parameters: TrialParameters,
