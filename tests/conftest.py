@@ -43,7 +43,7 @@ XLA_FLAGS = (
 
 def is_known(flag: str) -> bool:
     """Whether XLA has this flag: it ends the process over one that its version does not know."""
-    if "fusion_emitters" in flag and jaxlib.version.__version_info__ >= (0, 12):
+    if "fusion_emitters" in flag and jaxlib.version.__version_info__ >= (0, 11, 2):
         return False  # only the name is left in its library
     (library,) = Path(jaxlib.__file__).parent.glob("libjax_common.*")
     with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
