@@ -32,7 +32,7 @@ from dexsim.hand.vendor import LEAST_MASS, Draft, ImportOptions, Link, read_hand
 
 _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
-_RUBBER = 0.003  # m, by which the environment enlarges fingertips (`PhysicsConfig.pad_thickness`)
+_RUBBER = 0.003  # m, by which the environment enlarges fingertips (`Skin.margin`)
 _GAPS = (0.006, 0.010, 0.015, 0.020)  # m, between ball and links; the first that leaves room for boxes is taken
 _PRESSING = 2.75  # fingers that oppose the thumb at once: gives the XHand's highest target, 4.8 N, of its 13.2 N
 _CARRYING = 1.0  # N, of each of two fingers that carry 0.2 kg, the heaviest of the default objects

@@ -20,7 +20,9 @@ from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
 from dexsim.hand.mirror import AXIAL, POLAR, QUAT, mirror_hand
-from dexsim.touch.reduce import ForceEstimate, estimate_force, reduce_touch_links
+from dexsim.touch.reduce import estimate_force, reduce_touch_links
+
+VELOCITY_WEIGHT = 0.5  # of the newest difference in the estimate of the object's velocity
 
 
 @pytree_dataclass
@@ -88,7 +90,7 @@ def _relative_orientation(f: Features) -> jax.Array:
 
 
 def _finger_force(f: Features) -> jax.Array:
-    return estimate_force(f.config.force, f.hand, f.readings.taxel_force, f.readings.joint_torque)
+    return estimate_force(f.config.torque_share, f.hand, f.readings.taxel_force, f.readings.joint_torque)
 
 
 def _fingertip_velocity(f: Features) -> jax.Array:
@@ -133,8 +135,9 @@ class ObservationConfig(Config):
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=FIELDS)
     """Measured fields beyond the task's own, for actor and critic."""
-    force: ForceEstimate = setting(ForceEstimate())
-    """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
+    torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
+    """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`: share of the root torque's
+    force beyond the taxels' that counts. 0 for the taxels alone, 1 for the larger of both."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

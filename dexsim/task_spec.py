@@ -72,8 +72,6 @@ class TaskSpec(Config):
     """What the policy sees."""
     object_axes: tuple[bool, bool, bool] = (True, False, False)
     """Which coordinates of the object are measured."""
-    velocity_filter: float = setting(0.5, unit="1", low=0.01, high=1.0)
-    """Weight of the newest difference in the estimate of the object's velocity."""
     turn: TurnSpec | None = None
     """Goals that follow one another; None for a task without."""
     finger_force: tuple[float, float] | None = None
@@ -102,7 +100,6 @@ class TaskSpec(Config):
             control=config.control,
             observation=config.observation,
             object_axes=config.sensing.object_axes,
-            velocity_filter=config.sensing.velocity_filter,
             turn=task.turn,
             finger_force=task.finger_force,
         )
@@ -127,7 +124,7 @@ def correct_readings(
     """Readings whose command, the user's before, is what the force loop of `spec` shows the policy, and the correction
     [] in it. `period` is the control tick in s, `correction` that of the tick before; None at an episode's start."""
     assert spec.finger_force is not None, "checked when the specification was made"
-    force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
+    force = estimate_force(spec.observation.torque_share, hand, readings.taxel_force, readings.joint_torque)
     before = jnp.zeros(()) if correction is None else correction
     after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
     return dataclasses.replace(readings, command=readings.command + after), after

@@ -170,14 +170,11 @@ class Policy(Config):
             warnings.warn(text, OtherEnvWarning, stacklevel=2)
 
     @classmethod
-    def from_training(
-        cls, env: Environment, config: Any, state: Any, training: dict[str, Any] | None = None
-    ) -> "Policy":
-        """The policy of a learner with this `PPOConfig` and `TrainState`, whose arrays are copied; `training` is what
-        to remember of its origin."""
+    def from_training(cls, env: Environment, state: Any, training: dict[str, Any] | None = None) -> "Policy":
+        """The policy of a learner's `TrainState`, whose arrays are copied; `training` is what to remember of its
+        origin."""
         layout = tuple(env.observation_layout["actor"])
-        floor, clip = config.observation_std_floor, config.observation_clip
-        normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)
+        normalizer = make_normalizer(state.observation_stats["actor"], layout)
         actor, memory = state.average
         params = PolicyParams(actor, normalizer, memory)
         return cls(

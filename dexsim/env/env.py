@@ -55,7 +55,8 @@ class Env:
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
         self.spec = TaskSpec.of(task).mirror_for(hand)  # what a host must know to run this task's policies
         self.spec.check_hand(hand)
-        self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
+        given: dict[str, Any] = {"gravity": task.gravity, "backend": backend, "pad_thickness": config.skin.margin}
+        self.physics = Physics(hand, task.slots, task.largest, config.physics, **given)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
         self.touch_geometry = touch_geometry(config.objects, config.touch_method)
@@ -182,7 +183,7 @@ class Env:
     ) -> GroundTruth:
         """Where all is after the tick, and what the fingertips feel of it; `torque` is `Motors.current_torque`."""
         physics, object, delta = self.physics, episode.object, episode.hand.pad_thickness_delta
-        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
+        hand, skin = self.hand, self.config.skin
         qpos, qvel, force = result.state.qpos, result.state.qvel, result.finger_force
         joints, place, motion = qpos[physics.joint_qpos], qpos[physics.object_qpos], qvel[physics.object_dof]
         pose = forward_kinematics(hand, joints)
@@ -193,11 +194,9 @@ class Env:
         # In the links' frames, where the normals are constants.
         local = rotations.rotate_inverse(pose.tip_rotation, force)
         pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
-        if self.config.touch_method != "closed_form" or skin.margin != thickness:
-            # The contact's springs have the geometry and the rubber of the solver.
-            shape, bare = object.shape(), jnp.ones(hand.num_fingers)
-            rubber = dataclasses.replace(skin, margin=thickness)
-            bearing = compute_touch(hand, pose, shape, position, rotation, bare, rubber, delta)
+        if self.config.touch_method != "closed_form":  # the contact's springs have the solver's geometry
+            bare = jnp.ones(hand.num_fingers)
+            bearing = compute_touch(hand, pose, object.shape(), position, rotation, bare, skin, delta)
         skin_force = jnp.sum(bearing.skin_force, 1)
         return GroundTruth(
             object=object,

@@ -128,7 +128,7 @@ class SensorSuite:
             return position, jnp.zeros(3)
         step = (position - last.readings.object_position) / self.period
         velocity = last.readings.object_velocity
-        return position, velocity + sensing.velocity_filter * (step - velocity)
+        return position, velocity + observation.VELOCITY_WEIGHT * (step - velocity)
 
     def _read_orientation(
         self, key: jax.Array, now: SensorInput, before: SensorInput, episode: Episode, last: State | None
