@@ -222,10 +222,10 @@ class Env:
     ) -> dict[str, Any]:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
-        now, shown = self.sensors.input(truth), self.task.goal_readings(goal)
+        now, goal_reading = self.sensors.input(truth), self.task.goal_readings(goal)
         before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, taxel_memory = self.sensors.read(key, episode, now, before, shown, action, last)
+        readings, taxel_memory = self.sensors.read(key, episode, now, before, goal_reading, action, last)
         correction = None if last is None else last.correction
         if self.spec.force_loop:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
@@ -238,7 +238,7 @@ class Env:
             "readings": readings,
             "taxel_memory": taxel_memory,
             "correction": correction,
-            "obs": self.sensors.observe(readings, truth, shown),
+            "obs": self.sensors.observe(readings, truth, goal_reading),
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import leaf, pytree_dataclass, static
 from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
 from dexsim.objects.config import (
@@ -33,19 +33,19 @@ _SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 class ObjectParams:
     """One drawn object; every leaf may differ between environments."""
 
-    shape_index: jax.Array  # [] int32, into SHAPES
-    size: jax.Array  # [K, 3] m
-    position: jax.Array  # [K, 3] m, slot centres in the object's frame
-    active: jax.Array  # [K] bool
-    mass: jax.Array  # [] kg
-    inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
-    com: jax.Array  # [3] m
-    friction: jax.Array  # [] sliding on the fingertips
-    link_friction: jax.Array  # [] sliding on the rest of the hand
-    contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
-    quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
+    shape_index: jax.Array = leaf("[] int32, into SHAPES")
+    size: jax.Array = leaf("[K, 3] m")
+    position: jax.Array = leaf("[K, 3] m, slot centres in the object's frame")
+    active: jax.Array = leaf("[K] bool")
+    mass: jax.Array = leaf("[] kg")
+    inertia: jax.Array = leaf("[3] kg m^2 about the centre of mass, along the object's axes")
+    com: jax.Array = leaf("[3] m")
+    friction: jax.Array = leaf("[] sliding on the fingertips")
+    link_friction: jax.Array = leaf("[] sliding on the rest of the hand")
+    contact: jax.Array = leaf("[2] stiffness N/m and damping ratio of a contact")
+    quat: jax.Array | None = leaf("[K, 4] slot orientations in the object's frame; None: aligned", default=None)
     kinds: tuple[str, ...] = static(default=SLOTS)
-    extreme: jax.Array | None = None  # [] bool, whether every value is at an end of its range; None: no object's is
+    extreme: jax.Array | None = leaf("[] bool, every value is at an end of its range; None: never", default=None)
 
     def shape(self) -> sdf.Shape:
         """The union of primitives, for the taxels."""

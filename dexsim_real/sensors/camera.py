@@ -18,8 +18,7 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
-from dexsim.observation import VELOCITY_WEIGHT
-from dexsim.task_spec import TaskSpec
+from dexsim.task_spec import VELOCITY_WEIGHT, TaskSpec
 from dexsim_real.core.errors import HandError, find_function
 from dexsim_real.core.process import BACKGROUND, change_priority
 from dexsim_real.sensors.imu import IDENTITY, ImuReader

@@ -264,8 +264,7 @@ class TestEpisodes:
 def test_the_contacts_springs_have_the_solvers_geometry_whatever_the_taxels_feel_by(grasp_env, history):
     after, other = history[-1][2], copy.copy(grasp_env)
     other.config = dataclasses.replace(grasp_env.config, touch_method="surface_points")
-    # m, by which the taxels' geometry is off
-    other.touch_geometry = lambda object: dataclasses.replace(object.shape(), position=object.position + 0.001)
+    other.touch_geometry = lambda object: dataclasses.replace(object.shape(), position=object.position + 0.001)  # 1 mm
     none = jnp.zeros((5, 3))
     feel = jax.jit(jax.vmap(lambda s: ground_truth(other, s.episode.object, s.physics, none, s.episode.hand)))
     found, own = feel(after), after.tip_stiffness

@@ -26,8 +26,8 @@ WORLDS = 8
 
 
 def make(hand, cover=0.003, **changes):
-    config, options = PhysicsConfig(**changes), {"gravity": GRAVITY, "backend": "c", "pad_thickness": cover}
-    return Physics(hand, SLOTS, ObjectConfig().largest, config, **options)
+    config = PhysicsConfig(**changes)
+    return Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="c", pad_thickness=cover)
 
 
 def hold(index, position, velocity):
