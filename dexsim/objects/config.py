@@ -22,7 +22,6 @@ _SLOTS_OF: dict[str, tuple[str, ...]] = {
 SHAPES = tuple(_SLOTS_OF)
 KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
-COMPOSITION_SCALE = 0.8  # size of a composition's box or cylinder, relative to a single one
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
 PROPERTY_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
 """Ranges of `ObjectConfig` that are drawn anew at every episode start, in the order of their random keys."""

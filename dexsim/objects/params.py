@@ -15,17 +15,9 @@ import numpy as np
 from dexsim.core.pytree import leaf, pytree_dataclass, static
 from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
-from dexsim.objects.config import (
-    COMPOSITION_SCALE,
-    INACTIVE_SIZE,
-    KINDS,
-    PROPERTY_RANGES,
-    SHAPES,
-    SLOTS,
-    ObjectConfig,
-    load_mesh_object,
-)
+from dexsim.objects.config import INACTIVE_SIZE, KINDS, PROPERTY_RANGES, SHAPES, SLOTS, ObjectConfig, load_mesh_object
 
+_COMPOSITION_SCALE = 0.8  # size of a composition's box or cylinder, relative to a single one
 _SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -218,7 +210,7 @@ def _sample_slots(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
-    part = jnp.where(is_union, COMPOSITION_SCALE, 1.0)
+    part = jnp.where(is_union, _COMPOSITION_SCALE, 1.0)
     names = ("box_half", "cylinder_radius", "cylinder_half", "sphere_radius", "neck_radius", "neck_half")
     drawn = uniforms(keys[:6], [getattr(config, name) for name in names], extreme, (3,))
     half, (radius, length, ball, neck, neck_half) = part * drawn[0], drawn[1:, 0]
