@@ -134,8 +134,8 @@ class ObservationConfig(Config):
     add: tuple[str, ...] = setting((), choices=FIELDS)
     """Measured fields beyond the task's own, for actor and critic."""
     torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
-    """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`: share of the root torque's
-    force beyond the taxels' that counts. 0 for the taxels alone, 1 for the larger of both."""
+    """Share in the force estimate (`finger_force`, `Control.force`) of what a finger's root torque tells beyond its
+    taxels; 0 for the taxels alone."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -87,11 +87,6 @@ class TaskSpec(Config):
         if self.control.force.gain and self.finger_force is None:
             raise ConfigError(f"task {self.name!r}: Control.force needs a force command: set Control.force.gain to 0")
 
-    @property
-    def force_loop(self) -> bool:
-        """Whether the command is corrected by the estimated force."""
-        return self.control.force.gain > 0
-
     @classmethod
     def of(cls, task: Any) -> "TaskSpec":
         """The specification of a `dexsim.Task`."""

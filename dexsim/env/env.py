@@ -227,7 +227,7 @@ class Env:
         action = observed_action(self.config.control, self.hand, command.action, command.target)
         readings, taxel_memory = self.sensors.read(key, episode, now, before, goal_reading, action, last)
         correction = None if last is None else last.correction
-        if self.spec.force_loop:
+        if self.spec.control.force.gain:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
         return {
             "joint_target": command.target,
