@@ -101,8 +101,8 @@ def check_frame(hand: Hand) -> str:
             return f"finger {name!r} points along {way.round(2)} of {hand.palm!r} with its joints at 0, expected +z"
     aside = roots[0, 1] - roots[1:, 1].mean() if hand.num_fingers > 1 else 0.0
     if aside * hand.thumb_side < -_SIDEWAYS:
-        found, expected = ("-y", "+y") if hand.side == "right" else ("+y", "-y")
-        return f"the thumb is on the side of {found}, of a {hand.side} hand expected {expected}: turn palm or give side"
+        side, expected = ("-y", "+y") if hand.side == "right" else ("+y", "-y")
+        return f"the thumb is on the side of {side}, of a {hand.side} hand expected {expected}: turn palm or give side"
     return ""
 
 

@@ -28,11 +28,11 @@ from dexsim.hand.folder import write_hand
 from dexsim.hand.load import find_hand, load_hand
 from dexsim.hand.mirror import check_new, swap_sides, write_mirror
 from dexsim.hand.posture import find_grasp
-from dexsim.hand.vendor import LEAST_MASS, Draft, ImportOptions, Link, read_hand
+from dexsim.hand.vendor import LEAST_MASS, Draft, ImportConfig, Link, read_hand
 
 _TORQUE, _SPEED = 1.0, 8.0  # Nm and rad/s, where a file says nothing
 _SMALLEST = 0.008  # m, extent of a link that can touch
-_RUBBER = 0.003  # m, by which the environment enlarges fingertips (`PhysicsConfig.pad_thickness`)
+_RUBBER = 0.003  # m, by which the environment enlarges fingertips (`Skin.margin`)
 _GAPS = (0.006, 0.010, 0.015, 0.020)  # m, between ball and links; the first that leaves room for boxes is taken
 _PRESSING = 2.75  # fingers that oppose the thumb at once: gives the XHand's highest target, 4.8 N, of its 13.2 N
 _CARRYING = 1.0  # N, of each of two fingers that carry 0.2 kg, the heaviest of the default objects
@@ -40,7 +40,7 @@ _DENSITY = 1000.0  # kg/m^3, of links without a mass
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportArguments(ImportOptions):
+class ImportArguments(ImportConfig):
     """Make a hand's folder from a maker's URDF or MJCF."""
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -106,7 +106,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
     return path, passed
 
 
-def fit_links(draft: Draft, options: ImportOptions) -> None:
+def fit_links(draft: Draft, options: ImportConfig) -> None:
     """Limits, masses and capsules of all links, and the palm's box.
 
     Raises:

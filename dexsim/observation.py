@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.layout import LayoutEntry
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import leaf, pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist
 from dexsim.hand.mirror import AXIAL, POLAR, QUAT, mirror_hand
-from dexsim.touch.reduce import ForceEstimate, estimate_force, reduce_touch_links
+from dexsim.touch.reduce import estimate_force, reduce_touch_links
 
 
 @pytree_dataclass
@@ -31,25 +31,25 @@ class Readings:
     the policy is about to choose. Both worlds must keep to that.
     """
 
-    joint_position: jax.Array  # [J] rad
-    joint_torque: jax.Array  # [J] 1, torque over its calibrated maximum
-    taxel_force: jax.Array  # [F, N] N
-    object_position: jax.Array  # [3] m
-    object_velocity: jax.Array  # [3] m/s
-    object_quat: jax.Array  # [4] (w, x, y, z)
-    goal_quat: jax.Array  # [4] target orientation of the object
-    command: jax.Array  # [] grip command in [0, 1]
-    last_action: jax.Array  # [J] in [-1, 1]
-    past_actions: Any = None  # [2, J], the two before `last_action`, newest first
-    palm_gravity: Any = None  # [3] unit vector; measured while the object lies flat, before the episode
+    joint_position: jax.Array = leaf("[J] rad")
+    joint_torque: jax.Array = leaf("[J] 1, torque over its calibrated maximum")
+    taxel_force: jax.Array = leaf("[F, N] N")
+    object_position: jax.Array = leaf("[3] m")
+    object_velocity: jax.Array = leaf("[3] m/s")
+    object_quat: jax.Array = leaf("[4] (w, x, y, z)")
+    goal_quat: jax.Array = leaf("[4] target orientation of the object")
+    command: jax.Array = leaf("[] grip command in [0, 1]")
+    last_action: jax.Array = leaf("[J] in [-1, 1]")
+    past_actions: Any = leaf("[2, J], the two before `last_action`, newest first", default=None)
+    palm_gravity: Any = leaf("[3] unit vector; measured while the object lies flat, before the episode", default=None)
 
 
 @pytree_dataclass
 class Motion:
     """What only a simulator knows: the critic's part of an observation."""
 
-    joint_velocity: jax.Array  # [J] rad/s
-    object_spin: jax.Array  # [3] rad/s, palm frame
+    joint_velocity: jax.Array = leaf("[J] rad/s")
+    object_spin: jax.Array = leaf("[3] rad/s, palm frame")
 
 
 class Features(NamedTuple):
@@ -88,7 +88,7 @@ def _relative_orientation(f: Features) -> jax.Array:
 
 
 def _finger_force(f: Features) -> jax.Array:
-    return estimate_force(f.config.force, f.hand, f.readings.taxel_force, f.readings.joint_torque)
+    return estimate_force(f.config.torque_share, f.hand, f.readings.taxel_force, f.readings.joint_torque)
 
 
 def _fingertip_velocity(f: Features) -> jax.Array:
@@ -133,8 +133,9 @@ class ObservationConfig(Config):
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=FIELDS)
     """Measured fields beyond the task's own, for actor and critic."""
-    force: ForceEstimate = setting(ForceEstimate())
-    """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
+    torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
+    """Share in the force estimate (`finger_force`, `Control.force`) of what a finger's root torque tells beyond its
+    taxels; 0 for the taxels alone."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

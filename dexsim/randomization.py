@@ -69,9 +69,9 @@ class Randomization(Config):
     gravity_tilt: float = setting(0.1, nominal=0.0, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
     pad_thickness_delta: Range = setting((-0.003, 0.0), nominal=0.0, unit="m", low=-0.01, high=0.01)
-    """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.pad_thickness`,
-    `Skin.margin`); nominal 0. The maker's fingertip ends within 0.5 mm of the taxels, soft rubber yields before it
-    bears load: how far out a contact begins is not known. Thicknesses below 0 count as 0."""
+    """Change of the rubber's thickness over all fingertips (`Skin.margin`); nominal 0. The maker's fingertip ends
+    within 0.5 mm of the taxels, soft rubber yields before it bears load: how far out a contact begins is not known.
+    Thicknesses below 0 count as 0."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
     and phase; see `dexsim.core.ranges`."""
@@ -113,7 +113,7 @@ class HandParams:
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
     tilt: jax.Array  # [2] rad
-    pad_thickness_delta: jax.Array  # [] m, on top of `PhysicsConfig.pad_thickness`
+    pad_thickness_delta: jax.Array  # [] m, on top of `Skin.margin`
 
 
 def sample_hand(

@@ -19,6 +19,8 @@ from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.reduce import estimate_force
 
+VELOCITY_WEIGHT = 0.5  # of the newest difference in the estimate of the object's velocity
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TurnSpec(Config):
@@ -54,40 +56,36 @@ class TurnSpec(Config):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TaskSpec(Config):
-    """One task, as a host sees it. SI units, palm frame; in a policy's file that of a right hand."""
+    """One task, as a host sees it. SI units, palm frame; in a policy's file that of a right hand.
+
+    Attributes:
+      name: of the task.
+      fields: of the actor's observation, before `observation` leaves out or adds any; see `dexsim.observation`.
+      gravity: [3] m/s^2: how the hand is mounted.
+      reference: [3] m, where the object belongs; what stands in for coordinates that nothing measures.
+      posture: [J] rad, joint angles that an episode starts from; empty: from wherever the hand is.
+      control: from action to joint targets.
+      observation: what the policy sees.
+      object_axes: [3] bool, which coordinates of the object are measured.
+      turn: goals that follow one another; None for a task without.
+      finger_force: [2] N, force of a touching finger at the commands 0 and 1; None for a task without a force command.
+    """
 
     name: str
-    """The task's name."""
     fields: tuple[str, ...]
-    """Fields of the actor's observation, before `observation` leaves out or adds any; see `dexsim.observation`."""
     gravity: tuple[float, float, float] = setting((9.81, 0.0, 0.0), unit="m/s^2", low=-20.0, high=20.0)
-    """Gravity: how the hand is mounted."""
     reference: tuple[float, float, float] = setting((0.0, 0.0, 0.0), unit="m", low=-1.0, high=1.0)
-    """Where the object belongs; what stands in for coordinates that nothing measures."""
     posture: tuple[float, ...] = setting((), unit="rad", low=-7.0, high=7.0)
-    """Joint angles [J] that an episode starts from; empty: from wherever the hand is."""
     control: Control = setting(Control())
-    """From action to joint targets."""
     observation: ObservationConfig = setting(ObservationConfig())
-    """What the policy sees."""
     object_axes: tuple[bool, bool, bool] = (True, False, False)
-    """Which coordinates of the object are measured."""
-    velocity_filter: float = setting(0.5, unit="1", low=0.01, high=1.0)
-    """Weight of the newest difference in the estimate of the object's velocity."""
     turn: TurnSpec | None = None
-    """Goals that follow one another; None for a task without."""
     finger_force: tuple[float, float] | None = None
-    """Force in N of a touching finger at the commands 0 and 1; None for a task without a force command."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.control.force.gain and self.finger_force is None:
             raise ConfigError(f"task {self.name!r}: Control.force needs a force command: set Control.force.gain to 0")
-
-    @property
-    def force_loop(self) -> bool:
-        """Whether the command is corrected by the estimated force."""
-        return self.control.force.gain > 0
 
     @classmethod
     def of(cls, task: Any) -> "TaskSpec":
@@ -102,7 +100,6 @@ class TaskSpec(Config):
             control=config.control,
             observation=config.observation,
             object_axes=config.sensing.object_axes,
-            velocity_filter=config.sensing.velocity_filter,
             turn=task.turn,
             finger_force=task.finger_force,
         )
@@ -127,7 +124,7 @@ def correct_readings(
     """Readings whose command, the user's before, is what the force loop of `spec` shows the policy, and the correction
     [] in it. `period` is the control tick in s, `correction` that of the tick before; None at an episode's start."""
     assert spec.finger_force is not None, "checked when the specification was made"
-    force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
+    force = estimate_force(spec.observation.torque_share, hand, readings.taxel_force, readings.joint_torque)
     before = jnp.zeros(()) if correction is None else correction
     after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
     return dataclasses.replace(readings, command=readings.command + after), after

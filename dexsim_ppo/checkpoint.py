@@ -72,8 +72,8 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
     kind = lambda leaf: "nothing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"  # noqa: E731
     for name in expected.keys() | checkpoint.leaves.keys():
-        wanted, got = (kind(leaves.get(name)) for leaves in (expected, checkpoint.leaves))
-        if wanted != got:
+        needed, got = (kind(leaves.get(name)) for leaves in (expected, checkpoint.leaves))
+        if needed != got:
             where = f"{checkpoint.path}: does not fit this configuration"
-            raise CheckpointError(f"{where}: {name}: expected {wanted}, got {got}")
+            raise CheckpointError(f"{where}: {name}: expected {needed}, got {got}")
     return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in expected])

@@ -72,14 +72,14 @@ class Evaluator:
     def _episodes(self, params: PolicyParams, plan: Any, idle: bool) -> tuple[Any, Any]:
         """One chunk: metrics and termination flags [T, chunk], and snapshots and termination flags [T, shown]."""
         state = self.protocol.evaluation_starts(plan)
-        shown = self._extremes(state)
+        filmed = self._extremes(state)
 
         def step(carry, _):
             state, policy_carry = carry
             policy_carry, action = act(params, policy_carry, self.seen(state.obs["actor"]))
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
-            frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.protocol.snapshot)(state))
-            measured = (dict(state.metrics), state.terminated), (frame, state.terminated[shown])
+            frame = jax.tree.map(lambda x: x[filmed], jax.vmap(self.protocol.snapshot)(state))
+            measured = (dict(state.metrics), state.terminated), (frame, state.terminated[filmed])
             return (state, policy_carry), measured
 
         first: Any = state, zero_carry(params.memory, (self.chunk,))

@@ -20,7 +20,7 @@ import numpy as np
 from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
-from dexsim.core.layout import LayoutEntry, is_of, layout_size
+from dexsim.core.layout import LayoutEntry, layout_size
 from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
@@ -107,11 +107,13 @@ class Policy(Config):
 
         Shows what the policy relies on. A policy that was trained without those fields may do better.
         """
-        known = sorted(entry.name for entry in self.observation_layout)
-        if unknown := sorted(set(names) - set(known)):
-            raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(known)}")
+        layout = self.observation_layout
+        observed = sorted(entry.name for entry in layout)
+        if unknown := sorted(set(names) - set(observed)):
+            raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(observed)}")
+        ablated = np.repeat([entry.name in names for entry in layout], [entry.size for entry in layout])
         # Normalised observations have mean 0: the largest deviation leaves nothing else.
-        std = jnp.where(is_of(self.observation_layout, names), np.finfo(np.float32).max, self.params.normalizer.std)
+        std = jnp.where(ablated, np.finfo(np.float32).max, self.params.normalizer.std)
         normalizer = dataclasses.replace(self.params.normalizer, std=std)
         return dataclasses.replace(self, params=dataclasses.replace(self.params, normalizer=normalizer))
 
@@ -170,14 +172,11 @@ class Policy(Config):
             warnings.warn(text, OtherEnvWarning, stacklevel=2)
 
     @classmethod
-    def from_training(
-        cls, env: Environment, config: Any, state: Any, training: dict[str, Any] | None = None
-    ) -> "Policy":
-        """The policy of a learner with this `PPOConfig` and `TrainState`, whose arrays are copied; `training` is what
-        to remember of its origin."""
+    def from_training(cls, env: Environment, state: Any, training: dict[str, Any] | None = None) -> "Policy":
+        """The policy of a learner's `TrainState`, whose arrays are copied; `training` is what to remember of its
+        origin."""
         layout = tuple(env.observation_layout["actor"])
-        floor, clip = config.observation_std_floor, config.observation_clip
-        normalizer = make_normalizer(state.observation_stats["actor"], layout, std_floor=floor, clip=clip)
+        normalizer = make_normalizer(state.observation_stats["actor"], layout)
         actor, memory = state.average
         params = PolicyParams(actor, normalizer, memory)
         return cls(

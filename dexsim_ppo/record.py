@@ -59,13 +59,13 @@ def record(
     protocol = evaluation_of(env)
     starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(episodes, seed))
     run = jit(lambda begin: jax.lax.scan(tick, begin, None, length=ticks), backend=env.backend)
-    readings, target, ended, shown = jax.device_get(run((starts, policy.initial_carry(episodes)))[1])
+    readings, target, ended, frames = jax.device_get(run((starts, policy.initial_carry(episodes)))[1])
     trajectories, snapshots = [], []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
         rows = {name: values[:length, i] for name, values in readings.items()}
         trajectories.append(Trajectory(time=np.arange(length) * env.control_period, target=target[:length, i], **rows))
-        snapshots.append(shown.map(operator.itemgetter((slice(length), i))))
+        snapshots.append(frames.map(operator.itemgetter((slice(length), i))))
     return trajectories, snapshots
 
 
@@ -128,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.lerobot:
         if arguments.pictures:
             pairs = zip(trajectories, snapshots, strict=True)
-            trajectories = [dataclasses.replace(one, picture=draw_pictures(env, shown)) for one, shown in pairs]
+            trajectories = [dataclasses.replace(one, picture=draw_pictures(env, frames)) for one, frames in pairs]
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
         print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
@@ -139,8 +139,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"rerun recording: {arguments.rrd}")
     if arguments.npz:
         kinds, period = env.primitive_kinds, env.control_period
-        shown = Episodes(task=policy.task, hand=env.hand, period=period, kinds=kinds, snapshots=snapshots)
-        write_episodes(arguments.npz, shown)
+        recorded = Episodes(task=policy.task, hand=env.hand, period=period, kinds=kinds, snapshots=snapshots)
+        write_episodes(arguments.npz, recorded)
         print(f"episodes for dexsim view: {arguments.npz}")
     return 0
 

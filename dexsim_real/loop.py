@@ -32,7 +32,7 @@ GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LoopOptions(Config):
+class LoopConfig(Config):
     """Options of the exchange loop."""
 
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)

@@ -11,7 +11,7 @@
 | `~/motors` | std_srvs/SetBool | motors on at the measured pose; off for good |
 
 Commands are a stream: without one for `--safety.watchdog` the hand holds, then its motors go off. The parameter
-`options` has further options of `NodeOptions` as on a command line. rclpy is imported when the node runs.
+`options` has further options of `NodeArguments` as on a command line. rclpy is imported when the node runs.
 """
 
 import dataclasses
@@ -29,13 +29,13 @@ from dexsim_real.control.controller import prepare_jax
 from dexsim_real.control.guard import Guard
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
-from dexsim_real.loop import LoopOptions, LoopThread
+from dexsim_real.loop import LoopConfig, LoopThread
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.driver import open_port
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class NodeOptions(LoopOptions):
+class NodeArguments(LoopConfig):
     """Options in the parameter `options`."""
 
     guard: bool = True
@@ -59,7 +59,7 @@ class HandNode:
         self.node, self._joint_state, self._wrench = node, JointState, WrenchStamped
         given = {name: node.declare_parameter(name, "").value for name in ("port", "hand", "calibration")}
         words = shlex.split(node.declare_parameter("options", "").value)
-        self.options = options = cli.parse(NodeOptions, words, prog="options", description="Options of the node.")
+        self.options = options = cli.parse(NodeArguments, words, prog="options", description="Options of the node.")
         self.hand = hand = load_hand(given["hand"] or None)
         calibration = load_calibration(Path(given["calibration"]), hand) if given["calibration"] else None
         self.sensing = HandSensing(hand, options.hardware, calibration)

@@ -43,7 +43,7 @@ from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import BACKGROUND, change_priority, ignore_signals, leave_realtime, stopping, use_realtime
-from dexsim_real.loop import LoopOptions, LoopThread, Pace, Timing, keep_phase
+from dexsim_real.loop import LoopConfig, LoopThread, Pace, Timing, keep_phase
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, ObjectSensors, open_masks
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing
 from dexsim_real.sensors.imu import UPRIGHT_X, Imu
@@ -63,7 +63,7 @@ _LIVE = 0.25  # s between two updates of the tables
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunArguments(LoopOptions):
+class RunArguments(LoopConfig):
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]

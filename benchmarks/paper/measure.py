@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import zero_shot
 
 import dexsim
 from dexsim.core.config import from_dict, override, to_dict
-from dexsim.core.layout import is_of
 from dexsim.env.env import Env
 from dexsim.registry import find_task
 from dexsim.tasks.grasp.config import GraspConfig
@@ -148,7 +148,8 @@ class AnotherTouch(Evaluator):
 
     def seen(self, observation: jax.Array) -> jax.Array:
         """The observations [chunk, n] with touch from half a chunk further."""
-        touch = is_of(self.env.observation_layout["actor"], TOUCH)
+        layout = self.env.observation_layout["actor"]
+        touch = np.repeat([entry.name in TOUCH for entry in layout], [entry.size for entry in layout])
         return jnp.where(touch, jnp.roll(observation, self.chunk // 2, axis=0), observation)
 
 

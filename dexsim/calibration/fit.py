@@ -170,20 +170,20 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> tuple[S
         lines.append(line)
         notes += _doubts(line, f"{name} ({unit})")
         sound[keep] = line.inside
-    found = [line for line in lines if line is not None]
-    if not found:
+    fitted = [line for line in lines if line is not None]
+    if not fitted:
         raise CalibrationError(f"{where}: at least {MIN_SAMPLES} samples of rising or of falling force are needed")
-    if found[0].gain * found[-1].gain < 0:
+    if fitted[0].gain * fitted[-1].gain < 0:
         raise CalibrationError(
             f"{where}: rises with force while loading, falls while unloading; check joint and finger names"
         )
-    stand_in = found[0]._replace(gain_error=np.hypot(found[0].gain_error, _LOSSES * abs(found[0].gain)))
+    stand_in = fitted[0]._replace(gain_error=np.hypot(fitted[0].gain_error, _LOSSES * abs(fitted[0].gain)))
     both = {name: np.array([getattr(line or stand_in, name) for line in lines]) for name in Line._fields[:-1]}
     both["gain_error"] = np.hypot(both["gain_error"], press.gain_error * np.abs(both["gain"]))
     force, value = force[sound], np.abs(value[sound])
     middle = (np.min(force) + np.max(force)) / 2
-    friction = np.ptp(both["gain"] * middle + both["offset"]) / 2 if len(found) == 2 else np.array(np.nan)
-    if len(found) == 1:
+    friction = np.ptp(both["gain"] * middle + both["offset"]) / 2 if len(fitted) == 2 else np.array(np.nan)
+    if len(fitted) == 1:
         notes.append("moved one way only: friction and offset are not apart")
     if len(np.unique(number[direction != 0])) < LEAST_PRESSES:
         notes.append(f"fewer than {LEAST_PRESSES} presses: the intervals leave out how presses differ")

@@ -185,9 +185,9 @@ def _calibration(table: dict[str, Any], hand: Hand) -> Calibration:
     """The content of a file; whatever is not as `save_calibration` writes it raises."""
     own: dict[str, Any] = {"hand": hand.name, "joint_names": hand.joint_names, "finger_names": hand.finger_names}
     for name, expected in ({"format": FORMAT, "version": VERSION} | own).items():
-        found = table.pop(name)
-        if (tuple(found) if isinstance(found, list) else found) != expected:
-            raise ValueError(f"expected {name} {expected!r:.40}, got {found!r:.40}")
+        value = table.pop(name)
+        if (tuple(value) if isinstance(value, list) else value) != expected:
+            raise ValueError(f"expected {name} {expected!r:.40}, got {value!r:.40}")
     words: dict[str, Any] = {name: str(table.pop(name)) for name in ("serial", "handedness", "created")}
     notes = tuple(map(str, table.pop("notes")))
     for side in ("real", "sim"):
@@ -242,5 +242,5 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand) -> None
         values = np.asarray(values)
         bad = np.argwhere(~((values >= low) & (values <= high)))  # also NaN
         if len(bad):
-            found = f"{names[bad[0][-1]]}: {quantity} = {values[tuple(bad[0])]:.4g}"
-            raise CalibrationError(f"{where}: {found}: must be between {low:.4g} and {high:.4g} {unit}".rstrip())
+            outlier = f"{names[bad[0][-1]]}: {quantity} = {values[tuple(bad[0])]:.4g}"
+            raise CalibrationError(f"{where}: {outlier}: must be between {low:.4g} and {high:.4g} {unit}".rstrip())

@@ -1,9 +1,7 @@
 """The layout of an observation vector."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
-
-import numpy as np
 
 
 class LayoutEntry(NamedTuple):
@@ -18,8 +16,3 @@ class LayoutEntry(NamedTuple):
 def layout_size(layout: Iterable[LayoutEntry]) -> int:
     """Length of the observation vector that these entries make up."""
     return sum(entry.size for entry in layout)
-
-
-def is_of(layout: Iterable[LayoutEntry], names: Collection[str]) -> np.ndarray:
-    """Whether each value of the observation vector [n] is of one of the entries of these names."""
-    return np.concatenate([np.full(entry.size, entry.name in names) for entry in layout])

@@ -1,6 +1,7 @@
 """Dataclasses as pytrees, and a choice between two of them."""
 
 import dataclasses
+import inspect
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -29,7 +30,18 @@ def static(**kwargs: Any) -> Any:
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def leaf(text: str, **kwargs: Any) -> Any:
+    """A field with its shape, unit and meaning, which `help` shows."""
+    return dataclasses.field(metadata={"text": text}, **kwargs)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, leaf, dataclasses.field))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """A frozen dataclass whose fields are pytree children, except those marked `static()`."""
-    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+    """A frozen dataclass whose fields are pytree children, except those marked `static()`; its docstring lists those
+    that are a `leaf()`."""
+    cls = dataclasses.dataclass(frozen=True)(cls)
+    leaves = [field for field in dataclasses.fields(cls) if "text" in field.metadata]  # type: ignore[arg-type]
+    if leaves:
+        lines = [f"  {field.name}: {field.metadata['text']}" for field in leaves]
+        cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *lines])
+    return jax.tree_util.register_dataclass(cls)

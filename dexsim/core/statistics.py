@@ -23,11 +23,6 @@ def mean(values: np.ndarray) -> dict:
     return interval(lambda rows: values[rows].mean(), values.size)
 
 
-def median(values: np.ndarray) -> dict:
-    """Median of `values` [N] with a bootstrap 95 % interval."""
-    return interval(lambda rows: np.median(values[rows]), values.size, "median")
-
-
 def ratio(parts: np.ndarray, wholes: np.ndarray) -> dict:
     """Sum of `parts` [N] over sum of `wholes` [N] with a bootstrap 95 % interval: a rate over all of a time."""
     return interval(lambda rows: parts[rows].sum() / wholes[rows].sum(), parts.size if wholes.sum() > 0 else 0)

@@ -74,5 +74,5 @@ def read_episodes(path: Path, hand: str = "") -> Episodes:
         task, period, kinds = header["task"], header["period"], tuple(header["kinds"])
     except (KeyError, TypeError, ValueError, EOFError) as error:
         raise DexsimError(f"{path}: no recorded episodes: {error}") from None
-    found = recorded_hand(header["hand"], hand, f"{path}") or load_hand()
-    return Episodes(task=task, hand=found, period=period, kinds=kinds, snapshots=snapshots)
+    recorded = recorded_hand(header["hand"], hand, f"{path}") or load_hand()
+    return Episodes(task=task, hand=recorded, period=period, kinds=kinds, snapshots=snapshots)

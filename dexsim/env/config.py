@@ -29,8 +29,6 @@ class Sensing(Config):
     object_axes: tuple[bool, bool, bool] = setting((True, False, False))
     """Which coordinates of the object are measured; the others are fixed at the reference, as
     in the paper, where the camera gives only the height."""
-    velocity_filter: float = setting(0.5, unit="1", low=0.01, high=1.0)
-    """Weight of the newest difference in the object's velocity estimate."""
     orientation: ImuConfig = setting(ImuConfig())
     """The IMU inside the object."""
     taxel: TaxelSensor = setting(TaxelSensor())

@@ -55,7 +55,8 @@ class Env:
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
         self.spec = TaskSpec.of(task).mirror_for(hand)  # what a host must know to run this task's policies
         self.spec.check_hand(hand)
-        self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
+        given: dict[str, Any] = {"gravity": task.gravity, "backend": backend, "pad_thickness": config.skin.margin}
+        self.physics = Physics(hand, task.slots, task.largest, config.physics, **given)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
         self.touch_geometry = touch_geometry(config.objects, config.touch_method)
@@ -182,7 +183,7 @@ class Env:
     ) -> GroundTruth:
         """Where all is after the tick, and what the fingertips feel of it; `torque` is `Motors.current_torque`."""
         physics, object, delta = self.physics, episode.object, episode.hand.pad_thickness_delta
-        hand, skin, thickness = self.hand, self.config.skin, self.config.physics.pad_thickness
+        hand, skin = self.hand, self.config.skin
         qpos, qvel, force = result.state.qpos, result.state.qvel, result.finger_force
         joints, place, motion = qpos[physics.joint_qpos], qpos[physics.object_qpos], qvel[physics.object_dof]
         pose = forward_kinematics(hand, joints)
@@ -193,11 +194,9 @@ class Env:
         # In the links' frames, where the normals are constants.
         local = rotations.rotate_inverse(pose.tip_rotation, force)
         pressed = project_on_normals(touch, jnp.asarray(hand.taxel_normal), local)
-        if self.config.touch_method != "closed_form" or skin.margin != thickness:
-            # The contact's springs have the geometry and the rubber of the solver.
-            shape, bare = object.shape(), jnp.ones(hand.num_fingers)
-            rubber = dataclasses.replace(skin, margin=thickness)
-            bearing = compute_touch(hand, pose, shape, position, rotation, bare, rubber, delta)
+        if self.config.touch_method != "closed_form":  # the contact's springs have the solver's geometry
+            bare = jnp.ones(hand.num_fingers)
+            bearing = compute_touch(hand, pose, object.shape(), position, rotation, bare, skin, delta)
         skin_force = jnp.sum(bearing.skin_force, 1)
         return GroundTruth(
             object=object,
@@ -223,12 +222,12 @@ class Env:
     ) -> dict[str, Any]:
         """What sensors and policy see of a tick after the state `last` (None at an episode's start), and what of the
         truth the next tick needs: fields of `State`."""
-        now, shown = self.sensors.input(truth), self.task.goal_readings(goal)
+        now, goal_reading = self.sensors.input(truth), self.task.goal_readings(goal)
         before = now if last is None else self._last_input(last)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
-        readings, taxel_memory = self.sensors.read(key, episode, now, before, shown, action, last)
+        readings, taxel_memory = self.sensors.read(key, episode, now, before, goal_reading, action, last)
         correction = None if last is None else last.correction
-        if self.spec.force_loop:
+        if self.spec.control.force.gain:
             readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
         return {
             "joint_target": command.target,
@@ -239,7 +238,7 @@ class Env:
             "readings": readings,
             "taxel_memory": taxel_memory,
             "correction": correction,
-            "obs": self.sensors.observe(readings, truth, shown),
+            "obs": self.sensors.observe(readings, truth, goal_reading),
             "tip_stiffness": truth.tip_stiffness,
             "finger_force": length(truth.finger_force),
         }

@@ -17,6 +17,7 @@ from dexsim.observation import Motion, Readings
 from dexsim.randomization import tilted_down
 from dexsim.sensing.imu import measure_orientation
 from dexsim.sensing.taxels import TaxelArray, TaxelMemory
+from dexsim.task_spec import VELOCITY_WEIGHT
 
 
 @pytree_dataclass
@@ -128,7 +129,7 @@ class SensorSuite:
             return position, jnp.zeros(3)
         step = (position - last.readings.object_position) / self.period
         velocity = last.readings.object_velocity
-        return position, velocity + sensing.velocity_filter * (step - velocity)
+        return position, velocity + VELOCITY_WEIGHT * (step - velocity)
 
     def _read_orientation(
         self, key: jax.Array, now: SensorInput, before: SensorInput, episode: Episode, last: State | None

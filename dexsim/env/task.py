@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import leaf, pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.hand.kinematics import HandPose
@@ -29,38 +29,22 @@ from dexsim.touch.taxel_force import Touch
 class GroundTruth:
     """The truth after a tick: what reward, termination and the critic may look at."""
 
-    object: ObjectParams
-    """The episode's object: size, mass, friction."""
-    joint_position: jax.Array
-    """[J] rad."""
-    joint_velocity: jax.Array
-    """[J] rad/s."""
-    joint_torque: jax.Array
-    """[J] Nm, of the motors, before friction."""
-    torque_limited: jax.Array
-    """[J] bool, whether the motor is at its torque limit."""
-    pose: HandPose
-    """Poses of all links and finger tips."""
-    finger_force: jax.Array
-    """[F, 3] N, of the object on the finger tips."""
-    normal_force: jax.Array
-    """[F] N of it, into the skin; 0 where the finger touches with no taxel."""
-    touch: Touch
-    """Depth and force of every taxel."""
-    tip_stiffness: jax.Array
-    """[F] stiffness of the fingertips' contacts over nominal, as the next tick of physics has it."""
-    object_position: jax.Array
-    """[3] m."""
-    object_quat: jax.Array
-    """[4]."""
-    object_velocity: jax.Array
-    """[3] m/s."""
-    object_spin: jax.Array
-    """[3] rad/s."""
-    action: jax.Array
-    """[J] in [-1, 1], that led here."""
-    last_action: jax.Array
-    """[J], the one before."""
+    object: ObjectParams = leaf("the episode's object: size, mass, friction")
+    joint_position: jax.Array = leaf("[J] rad")
+    joint_velocity: jax.Array = leaf("[J] rad/s")
+    joint_torque: jax.Array = leaf("[J] Nm, of the motors, before friction")
+    torque_limited: jax.Array = leaf("[J] bool, whether the motor is at its torque limit")
+    pose: HandPose = leaf("poses of all links and finger tips")
+    finger_force: jax.Array = leaf("[F, 3] N, of the object on the finger tips")
+    normal_force: jax.Array = leaf("[F] N of it, into the skin; 0 where the finger touches with no taxel")
+    touch: Touch = leaf("[F, N] depth and force of every taxel")
+    tip_stiffness: jax.Array = leaf("[F] 1, stiffness of the fingertips' contacts over nominal, in the next tick")
+    object_position: jax.Array = leaf("[3] m")
+    object_quat: jax.Array = leaf("[4] (w, x, y, z)")
+    object_velocity: jax.Array = leaf("[3] m/s")
+    object_spin: jax.Array = leaf("[3] rad/s")
+    action: jax.Array = leaf("[J] in [-1, 1], that led here")
+    last_action: jax.Array = leaf("[J], the one before")
 
 
 class Task(abc.ABC):
@@ -70,38 +54,41 @@ class Task(abc.ABC):
     `evaluation_plan` and `summarize`, which run once, on the host. `Goal` stands for the task's own pytree of arrays,
     which an episode carries from tick to tick. A task sets the attributes without a value here, and overrides the
     abstract methods at least.
+
+    Attributes:
+      name: of the task.
+      fields: names of the observation's fields (`dexsim.observation.FIELDS`), for "actor" and for "critic".
+      gravity: [3] m/s^2; it says how the hand is mounted.
+      reference: [3] m, where the object belongs; readings show it for coordinates that are not measured.
+      episode_ticks: time limit of a training episode, control ticks.
+      slots: [K] kinds of the primitives that objects consist of: "box", "capsule", "cylinder".
+      largest: [K, 3] m, upper bound of each primitive's size.
+      evaluation_ticks: length of an evaluation episode, control ticks.
+      evaluation: what `summarize` is given: "series" or "totals".
+      config: an `EnvConfig` or a subclass with settings of the task's own.
+      object_ranges: ranges of physical properties, as "objects.mass", that are drawn anew at every episode start; the
+        others, and sizes, stay as the pool has them.
+      shape_names: what `ObjectParams.shape_index` counts.
+      posture: [J] rad, joint angles that an episode on a hand starts from; empty: from wherever the hand is.
+      turn: goals that follow one another about an axis, for a task that has them; see `turns`.
+      finger_force: [2] N, force of a touching finger at the commands 0 and 1, for a task with a force command.
     """
 
     name: str
     fields: dict[str, tuple[str, ...]]
-    """Names of the observation's fields (`dexsim.observation.FIELDS`), for "actor" and for "critic"."""
     gravity: tuple[float, float, float]
-    """m/s^2; it says how the hand is mounted."""
     reference: tuple[float, float, float]
-    """m, where the object belongs; readings show it for coordinates that are not measured."""
     episode_ticks: int
-    """Time limit of a training episode, control ticks."""
     slots: tuple[str, ...]
-    """Kinds of the primitives [K] that objects consist of: "box", "capsule", "cylinder"."""
     largest: np.ndarray
-    """[K, 3] m, upper bound of each primitive's size."""
     evaluation_ticks: int
-    """Length of an evaluation episode, control ticks."""
     evaluation: str
-    """What `summarize` is given: "series" or "totals"."""
     config: EnvConfig
-    """An `EnvConfig` or a subclass with settings of the task's own."""
     object_ranges: tuple[str, ...] = tuple(f"objects.{name}" for name in PROPERTY_RANGES)
-    """Ranges of physical properties, as "objects.mass", that are drawn anew at every episode start; the others, and
-    sizes, stay as the pool has them."""
     shape_names: tuple[str, ...] = KINDS
-    """What `ObjectParams.shape_index` counts."""
     posture: tuple[float, ...] = ()
-    """rad, joint angles [J] that an episode on a hand starts from; empty: from wherever the hand is."""
     turn: TurnSpec | None = None
-    """Goals that follow one another about an axis, for a task that has them; see `turns`."""
     finger_force: tuple[float, float] | None = None
-    """N, force of a touching finger at the commands 0 and 1, for a task with a force command."""
 
     @abc.abstractmethod
     def make_pool(self, key: jax.Array) -> Start:

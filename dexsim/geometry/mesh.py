@@ -103,11 +103,11 @@ def signed_distance(mesh: Trimesh, points: np.ndarray) -> np.ndarray:
     for start in range(0, len(points), step):
         some = points[start : start + step]
         row, face = np.nonzero(cdist(some, middle) - radius <= reach[start : start + step, None])
-        apart = some[row] - trimesh.triangles.closest_point(corners[face], some[row])
-        gap = np.linalg.norm(apart, axis=-1)
+        offset = some[row] - trimesh.triangles.closest_point(corners[face], some[row])
+        gap = np.linalg.norm(offset, axis=-1)
         least = np.full(len(some), np.inf)
         np.minimum.at(least, row, gap)
-        off_plane = np.sum(apart * normals[face], -1)
+        off_plane = np.sum(offset * normals[face], -1)
         # The last triangle of each point is the one that tells inside from outside.
         order = np.lexsort((np.where(gap <= least[row] + _TIE, np.abs(off_plane), -1.0), row))
         last = order[np.searchsorted(row[order], np.arange(len(some)), side="right") - 1]

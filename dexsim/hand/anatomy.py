@@ -11,7 +11,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.description import unit
-from dexsim.hand.vendor import Direction, Draft, ImportOptions, Link
+from dexsim.hand.vendor import Direction, Draft, ImportConfig, Link
 
 _FLEXION = 0.7  # cosine to the axis of a finger's last joint above which another joint flexes, too
 _NAMES = ("index", "middle", "ring", "pinky", "sixth")
@@ -19,7 +19,7 @@ _THUMB = re.compile(r"thumb|(^|[^a-z])th([^a-z]|[jmdpb]|$)", re.IGNORECASE)
 _SNAP = np.cos(np.radians(10.0))  # a frame this near to the file's axes is meant to be along them
 
 
-def orient(draft: Draft, options: ImportOptions) -> None:
+def orient(draft: Draft, options: ImportConfig) -> None:
     """Find fingers, palm frame, signs and side, and turn the links into them.
 
     Raises:
@@ -111,9 +111,9 @@ def _find_thumb(draft: Draft, chains: list[list[int]], given: str) -> int:
     scores = []
     for index in range(len(chains)):
         rest = np.delete(np.arange(len(chains)), index)
-        apart = np.linalg.norm(roots[index] - roots[rest].mean(0))
+        distance = np.linalg.norm(roots[index] - roots[rest].mean(0))
         width = np.linalg.norm(roots[rest] - roots[rest].mean(0), axis=1).mean() + 0.02
-        scores.append(alike[np.ix_(rest, rest)].mean() - alike[index, rest].mean() + 0.3 * apart / width)
+        scores.append(alike[np.ix_(rest, rest)].mean() - alike[index, rest].mean() + 0.3 * distance / width)
     best = int(np.argmax(scores))
     taken = links[chains[best][-1]].name
     draft.findings.append(f"note         no link is named thumb: taken for it is {taken}; --thumb NAME changes it")

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import Array, pytree_dataclass
+from dexsim.core.pytree import Array, leaf, pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 
@@ -13,10 +13,10 @@ from dexsim.hand.description import Hand
 class HandPose:
     """Poses of all links and finger tips in the palm frame."""
 
-    body_position: jax.Array  # [B, 3] m
-    body_rotation: jax.Array  # [B, 3, 3]
-    tip_position: jax.Array  # [F, 3] m
-    tip_rotation: jax.Array  # [F, 3, 3]
+    body_position: jax.Array = leaf("[B, 3] m")
+    body_rotation: jax.Array = leaf("[B, 3, 3]")
+    tip_position: jax.Array = leaf("[F, 3] m")
+    tip_rotation: jax.Array = leaf("[F, 3, 3]")
 
 
 def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:

@@ -31,7 +31,7 @@ Direction = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ImportOptions(Config):
+class ImportConfig(Config):
     """What a file does not say, or what is to be read otherwise."""
 
     palm: str = ""
@@ -103,7 +103,7 @@ class Draft:
         return [self.links[at] for at in order if self.links[at].is_motor]
 
 
-def read_hand(path: Path, options: ImportOptions) -> Draft:
+def read_hand(path: Path, options: ImportConfig) -> Draft:
     """Read a hand from a URDF or MJCF.
 
     Raises:
@@ -279,9 +279,7 @@ def _stall_torques(model: mujoco.MjModel) -> dict[int, float]:
     return torques
 
 
-def _read_links(
-    model: mujoco.MjModel, options: ImportOptions, speeds: dict[str, float], notes: list[str]
-) -> list[Link]:
+def _read_links(model: mujoco.MjModel, options: ImportConfig, speeds: dict[str, float], notes: list[str]) -> list[Link]:
     """The palm and a link for each hinge below it that is not frozen; of two hinges on one body the first moves a link
     without a shape."""
     names, freeze = [model.joint(j).name or f"joint_{j}" for j in range(model.njnt)], options.freeze

@@ -57,8 +57,6 @@ class ObjectConfig(Config):
     """Radius of the capsule that juts out of a composition."""
     neck_half: Range = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
     """Half-length of that capsule's straight part."""
-    composition_scale: float = setting(0.8, unit="1", low=0.1, high=2.0)
-    """Size of a composition's box or cylinder, relative to a single one."""
     mass: Range = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
     """Mass of the object."""
     inertia_scale: Range = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
@@ -99,11 +97,10 @@ class ObjectConfig(Config):
             return self.mesh_size[1] * load_mesh_object(self).boxes.size
         radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
         half = max(self.cylinder_half[1], self.neck_half[1])
-        body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
         size = {
-            "box": [body * self.box_half[1]] * 3,
+            "box": [self.box_half[1]] * 3,
             "capsule": [radius, half, 0.0],
-            "cylinder": [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0],
+            "cylinder": [self.cylinder_radius[1], self.cylinder_half[1], 0.0],
         }
         return np.array([size[slot] for slot in self.slots])
 

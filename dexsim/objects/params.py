@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import leaf, pytree_dataclass, static
 from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
 from dexsim.objects.config import INACTIVE_SIZE, KINDS, PROPERTY_RANGES, SHAPES, SLOTS, ObjectConfig, load_mesh_object
 
+_COMPOSITION_SCALE = 0.8  # size of a composition's box or cylinder, relative to a single one
 _SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -24,19 +25,19 @@ _SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 class ObjectParams:
     """One drawn object; every leaf may differ between environments."""
 
-    shape_index: jax.Array  # [] int32, into SHAPES
-    size: jax.Array  # [K, 3] m
-    position: jax.Array  # [K, 3] m, slot centres in the object's frame
-    active: jax.Array  # [K] bool
-    mass: jax.Array  # [] kg
-    inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
-    com: jax.Array  # [3] m
-    friction: jax.Array  # [] sliding on the fingertips
-    link_friction: jax.Array  # [] sliding on the rest of the hand
-    contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
-    quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
+    shape_index: jax.Array = leaf("[] int32, into SHAPES")
+    size: jax.Array = leaf("[K, 3] m")
+    position: jax.Array = leaf("[K, 3] m, slot centres in the object's frame")
+    active: jax.Array = leaf("[K] bool")
+    mass: jax.Array = leaf("[] kg")
+    inertia: jax.Array = leaf("[3] kg m^2 about the centre of mass, along the object's axes")
+    com: jax.Array = leaf("[3] m")
+    friction: jax.Array = leaf("[] sliding on the fingertips")
+    link_friction: jax.Array = leaf("[] sliding on the rest of the hand")
+    contact: jax.Array = leaf("[2] stiffness N/m and damping ratio of a contact")
+    quat: jax.Array | None = leaf("[K, 4] slot orientations in the object's frame; None: aligned", default=None)
     kinds: tuple[str, ...] = static(default=SLOTS)
-    extreme: jax.Array | None = None  # [] bool, whether every value is at an end of its range; None: no object's is
+    extreme: jax.Array | None = leaf("[] bool, every value is at an end of its range; None: never", default=None)
 
     def shape(self) -> sdf.Shape:
         """The union of primitives, for the taxels."""
@@ -209,7 +210,7 @@ def _sample_slots(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
-    part = jnp.where(is_union, config.composition_scale, 1.0)
+    part = jnp.where(is_union, _COMPOSITION_SCALE, 1.0)
     names = ("box_half", "cylinder_radius", "cylinder_half", "sphere_radius", "neck_radius", "neck_half")
     drawn = uniforms(keys[:6], [getattr(config, name) for name in names], extreme, (3,))
     half, (radius, length, ball, neck, neck_half) = part * drawn[0], drawn[1:, 0]

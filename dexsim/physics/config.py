@@ -17,12 +17,6 @@ class PhysicsConfig(Config):
     iterations: int = setting(0, unit="1", low=0, high=100)
     """Newton iterations of the contact solver at most; 0 for as many as the engine needs to converge. Three leave
     forces of moving hands 2 to 4 N off at the 90th percentile."""
-    tolerance: float = setting(1e-8, unit="1", low=0.0, high=1e-2)
-    """MuJoCo's `tolerance`: the solver stops when neither cost nor gradient would improve by more. cuda, in single
-    precision, stops at its own if that is coarser."""
-    pad_thickness: float = setting(0.003, unit="m", low=0.0, high=0.01)
-    """Thickness of the rubber over the fingertips, by which their geoms are enlarged. Keep it equal to `Skin.margin`,
-    so that contact begins at the same distance for solver and taxels."""
 
     def __post_init__(self):
         super().__post_init__()

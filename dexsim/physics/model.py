@@ -12,6 +12,7 @@ from dexsim.hand.mjcf import disabled, read_mjcf
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsScene
+from dexsim.touch.skin import Skin
 
 # Newton iterations and evaluations of a line search with which forces have converged. c and cuda stop by themselves,
 # mjx computes all of them. With 6 evaluations C MuJoCo's forces were off by up to 28 N in grips, with 20 by 0.5 N where
@@ -30,14 +31,15 @@ def build_scene(
     config: PhysicsConfig,
     gravity: tuple[float, float, float],
     backend: str,
+    pad_thickness: float = Skin.margin,
 ) -> PhysicsScene:
     """The scene for an engine: hand, free object, explicit pairs, force sensors, and the addresses of what changes in
-    the model. Raises AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the
-    object."""
+    the model. `pad_thickness` is in m. Raises AssetError: the backend cannot simulate the hand's MJCF, or it does not
+    go into one scene with the object."""
     check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), hand.model_path)
     spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     touching = _touching_geoms(hand, slots)
-    contact.thicken_tips(spec, hand, config.pad_thickness)
+    contact.thicken_tips(spec, hand, pad_thickness)
     touching = contact.split_pads(spec, hand, touching)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
@@ -134,7 +136,7 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     # A pyramid approximates the cone, and objects creep through the fingers at 12 to 25 mm/s with it.
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, _FRICTION_RATIO
     option.iterations, option.ls_iterations = CONVERGED[backend]
-    option.iterations, option.tolerance = config.iterations or option.iterations, config.tolerance
+    option.iterations = config.iterations or option.iterations
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
     # A capsule over a cylinder's rim: the search for more than one contact answers with two at the same place, along
     # the cylinder's axis instead of away from it, and too shallow.

@@ -25,6 +25,7 @@ from dexsim.physics.cuda.backend import CudaBackend
 from dexsim.physics.interface import Backend, Fields, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.law import implicit
 from dexsim.physics.model import build_scene
+from dexsim.touch.skin import Skin
 
 
 def _mjx(scene: PhysicsScene) -> Backend:
@@ -67,6 +68,7 @@ class Physics:
         *,
         gravity: tuple[float, float, float],
         backend: str = "auto",
+        pad_thickness: float = Skin.margin,
     ):
         """Compile.
 
@@ -77,14 +79,15 @@ class Physics:
           config: solver and contact model.
           gravity: m/s^2 in the palm frame, which is the world's.
           backend: "auto", "c", "cuda" or "mjx".
+          pad_thickness: m, of the rubber over the fingertips, by which their geoms are enlarged (`Skin.margin`).
 
         Raises:
           AssetError: the model uses what the backend ignores or lacks.
           ConfigError: see `choose_backend`.
         """
         self.backend = choose_backend(backend)
-        self.hand, self.config = hand, config
-        self.scene = scene = build_scene(hand, slots, largest, config, gravity, self.backend)
+        self.hand, self.config, self.pad_thickness = hand, config, pad_thickness
+        self.scene = scene = build_scene(hand, slots, largest, config, gravity, self.backend, pad_thickness)
         self.engine = BACKENDS[self.backend](scene)
         self.mj_model = scene.model
         self.joint_qpos, self.joint_dof = scene.joint_qpos, scene.joint_dof
@@ -130,7 +133,7 @@ class Physics:
         Args:
           object: the object.
           tip_stiffness: [F] the fingertips' stiffness over the nominal one (`tip_stiffness`); None for 1.
-          pad_thickness_delta: [] m, change of the thickness of their rubber from `PhysicsConfig.pad_thickness`.
+          pad_thickness_delta: [] m, change of the thickness of their rubber.
         """
         scene, delta = self.scene, self._delta(pad_thickness_delta)
         friction = jnp.where(self._finger_of_pair >= 0, object.friction, object.link_friction)
@@ -194,7 +197,7 @@ class Physics:
 
     def _delta(self, pad_thickness_delta: jax.Array | float) -> jax.Array:
         # No rubber is the least.
-        return jnp.maximum(jnp.asarray(pad_thickness_delta, jnp.float32), -self.config.pad_thickness)
+        return jnp.maximum(jnp.asarray(pad_thickness_delta, jnp.float32), -self.pad_thickness)
 
 
 def revert_if_diverged(result: StepResult, before: PhysicsState, valid: jax.Array) -> tuple[StepResult, jax.Array]:

@@ -215,11 +215,11 @@ class Canvas:
         index, depth = index.reshape(rays.shape[:2]), distance.reshape(rays.shape[:2])
         return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
 
-    def paint(self, primitives: Primitives, surface: Surface, seen: np.ndarray, opacity: float = 1.0) -> None:
-        """Shade what is `seen` [H, W] of a surface by sky, ground and one warm key light, and lay it over the
+    def paint(self, primitives: Primitives, surface: Surface, visible: np.ndarray, opacity: float = 1.0) -> None:
+        """Shade what is `visible` [H, W] of a surface by sky, ground and one warm key light, and lay it over the
         picture."""
-        index, normal = surface.primitive[seen], surface.normal[seen]
-        away = (1 - np.clip(-np.sum(normal * unit(self.rays[seen]), -1), 0, 1))[:, None]
+        index, normal = surface.primitive[visible], surface.normal[visible]
+        away = (1 - np.clip(-np.sum(normal * unit(self.rays[visible]), -1), 0, 1))[:, None]
         shade = _GROUND + (0.5 + 0.5 * normal @ self._up)[:, None] * (_SKY - _GROUND)
         shade += np.maximum(normal @ self._light, 0)[:, None] * _KEY
         local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
@@ -227,7 +227,7 @@ class Canvas:
         shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
         shade += 0.1 * away**3  # a rim of light
         # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
-        self._color[seen] += (opacity + (1 - opacity) * away**2) * (shade - self._color[seen])
+        self._color[visible] += (opacity + (1 - opacity) * away**2) * (shade - self._color[visible])
 
     def paint_taxels(
         self, pose: Pose, force: np.ndarray, force_range: float, depth: np.ndarray, glow: float | None = None

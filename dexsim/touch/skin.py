@@ -31,8 +31,8 @@ class Skin(Config):
     thickness: float = setting(0.003, unit="m", low=1e-4, high=0.02)
     """Thickness of the compressed layer."""
     margin: float = setting(0.003, unit="m", low=0.0, high=0.01)
-    """Distance above the object's surface at which a taxel begins to feel it: the thickness of the rubber over the
-    lattice. `PhysicsConfig.pad_thickness` is the same distance for the solver."""
+    """Distance above the object's surface at which a taxel begins to feel it, and the solver's contact begins: the
+    thickness of the rubber over lattice and fingertip."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
     law: str = setting("mooney_rivlin", choices=("mooney_rivlin", "linear"))

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import leaf, pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.geometry.distance import signed_distance
 from dexsim.hand.description import Hand
@@ -24,9 +24,9 @@ from dexsim.touch.skin import Skin, skin_stress
 class Touch:
     """What the taxels feel, before the sensor's own imperfections."""
 
-    depth: jax.Array  # [F, N] m, compression of the skin (>= 0)
-    skin_force: jax.Array  # [F, N] N, by the skin's law alone
-    force: jax.Array  # [F, N] N, the finger's total from the physics, shared by `skin_force`
+    depth: jax.Array = leaf("[F, N] m, compression of the skin (>= 0)")
+    skin_force: jax.Array = leaf("[F, N] N, by the skin's law alone")
+    force: jax.Array = leaf("[F, N] N, the finger's total from the physics, shared by `skin_force`")
 
 
 def compute_touch(

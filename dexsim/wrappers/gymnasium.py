@@ -100,13 +100,13 @@ class GymVectorEnv(VectorEnv):
           masks `_final_obs`, `_final_info`.
         """
         self._state, last = self._advance(self._state, np.asarray(actions, np.float32))
-        seen, info = (last if self._same_step else self._state), dict[str, Any]()
-        terminated, truncated = np.array(seen.terminated), np.array(seen.truncated)
+        reported, info = (last if self._same_step else self._state), dict[str, Any]()
+        terminated, truncated = np.array(reported.terminated), np.array(reported.truncated)
         done = terminated | truncated
         if self._same_step and done.any():
             ends, final = {name: np.array(last.metrics[name]) for name in ("return", "length")}, last.obs["actor"]
             info = {"final_obs": np.array(final), "_final_obs": done, "final_info": ends, "_final_info": done}
-        return np.array(self._state.obs["actor"]), np.array(seen.reward), terminated, truncated, info
+        return np.array(self._state.obs["actor"]), np.array(reported.reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8 [480, 640, 3] each: hand and object, and the forces of the taxels."""

@@ -6,6 +6,9 @@ from typing import Literal
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 
+STD_MIN, STD_MAX = 0.05, 1.0
+"""Bounds of the actions' standard deviation during training. More than 1 is mostly clipped at +-1."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig(Config):
@@ -29,8 +32,6 @@ class PPOConfig(Config):
     """Relative change of an action's probability beyond which its gradient is zero."""
     value_clip: float = setting(0.2, unit="value deviations", low=0.0)
     """Change of a value beyond which its gradient is zero; 0 turns value clipping off."""
-    value_coefficient: float = setting(1.0, unit="1", low=0.0)
-    """Weight of the value loss."""
     entropy_coefficient: float = setting(0.0, unit="1", low=0.0)
     """Weight of the entropy bonus."""
     bounds_coefficient: float = setting(1e-3, unit="1", low=0.0)
@@ -50,12 +51,8 @@ class PPOConfig(Config):
     critic_first: int = setting(0, unit="iterations", low=0)
     """Initial iterations that train only the critic: in fine-tuning it is new. Above 0, the critic always learns at
     `learning_rate_max`."""
-    initial_std: float = setting(0.6, unit="1", low=1e-3, high=10.0)
+    initial_std: float = setting(0.6, unit="1", low=STD_MIN, high=STD_MAX)
     """Initial standard deviation of actions, whose range is [-1, 1]."""
-    std_min: float = setting(0.05, unit="1", low=1e-4, high=10.0)
-    """Floor of the standard deviation."""
-    std_max: float = setting(1.0, unit="1", low=1e-4, high=10.0)
-    """Cap of the standard deviation."""
     actor_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
     """Hidden layer sizes of the actor."""
     critic_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
@@ -64,10 +61,6 @@ class PPOConfig(Config):
     """What the policy keeps of an episode: nothing, or the state of a gated recurrent unit."""
     memory_size: int = setting(64, unit="1", low=1, high=4096)
     """Units of `gru`. Its gradient goes back to the start of the rollout."""
-    observation_std_floor: float = setting(1e-2, unit="observation units", low=0.0)
-    """Smallest deviation that a running observation normaliser divides by."""
-    observation_clip: float = setting(5.0, unit="1", low=0.1, high=1e4)
-    """Bound on the magnitude of normalised observations."""
     matmul_precision: Literal["default", "high", "highest"] = setting("highest")
     """Precision of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
 
@@ -78,15 +71,11 @@ class PPOConfig(Config):
             raise ConfigError(
                 f"PPOConfig.minibatches = {self.minibatches}: must divide PPOConfig.num_envs{of}, which is {self.rows}"
             )
-        for low, mid, high in (
-            ("learning_rate_min", "learning_rate", "learning_rate_max"),
-            ("std_min", "initial_std", "std_max"),
-        ):
-            if not getattr(self, low) <= getattr(self, mid) <= getattr(self, high):
-                raise ConfigError(
-                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between PPOConfig.{low} "
-                    f"= {getattr(self, low):g} and PPOConfig.{high} = {getattr(self, high):g}"
-                )
+        if not self.learning_rate_min <= self.learning_rate <= self.learning_rate_max:
+            raise ConfigError(
+                f"PPOConfig.learning_rate = {self.learning_rate:g}: must be between PPOConfig.learning_rate_min "
+                f"= {self.learning_rate_min:g} and PPOConfig.learning_rate_max = {self.learning_rate_max:g}"
+            )
 
     @property
     def steps_per_iteration(self) -> int:

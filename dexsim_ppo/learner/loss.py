@@ -34,13 +34,9 @@ class Samples:
     first: jax.Array | None = None  # whether the step is the first of an episode, with a GRU
 
 
-def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> Normalizers:
+def make_normalizers(env: Environment, stats: dict[str, RunningStats]) -> Normalizers:
     """One observation normaliser per group."""
-    floor, clip = config.observation_std_floor, config.observation_clip
-    return {
-        group: make_normalizer(stats[group], layout, std_floor=floor, clip=clip)
-        for group, layout in env.observation_layout.items()
-    }
+    return {group: make_normalizer(stats[group], layout) for group, layout in env.observation_layout.items()}
 
 
 def actor_mean(config: PPOConfig, params: Params, normalizers: Normalizers, samples: Samples) -> jax.Array:
@@ -87,12 +83,8 @@ def loss(
 
     entropy = distribution.entropy(params.log_std)
     bounds_loss = jnp.mean(distribution.bounds_loss(mean))
-    total = (
-        policy_loss
-        + config.value_coefficient * value_loss
-        + config.bounds_coefficient * bounds_loss
-        - config.entropy_coefficient * entropy
-    )
+    # The value loss has no weight: the critic has parameters of its own, and Adam divides by a gradient's size.
+    total = policy_loss + value_loss + config.bounds_coefficient * bounds_loss - config.entropy_coefficient * entropy
     kl = distribution.kl_divergence(batch.decision.mean, old_log_std, mean, params.log_std)
     return total, {
         "policy_loss": policy_loss,

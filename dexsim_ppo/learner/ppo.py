@@ -131,7 +131,7 @@ def train_iteration(
     key, _, update_key = jax.random.split(state.key, 3)
     (env_state, carry), rollout, metrics = collect_rollout(env, config, state, mesh)
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
-    normalizers = make_normalizers(env, config, state.observation_stats)
+    normalizers = make_normalizers(env, state.observation_stats)
     rollout, bounded = bound_rewards(rollout, state.value_stats)
     samples, state, explained = prepare(config, state, rollout, mesh)
     learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)

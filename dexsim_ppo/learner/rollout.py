@@ -51,7 +51,7 @@ def collect_rollout(
       The last environment states [B] and carry [B, m], the experience, whose values are in reward units, and its
       metrics; see `rollout_metrics`.
     """
-    normalizers, key = make_normalizers(env, config, state.observation_stats), jax.random.split(state.key, 3)[1]
+    normalizers, key = make_normalizers(env, state.observation_stats), jax.random.split(state.key, 3)[1]
     params, std, step_env = state.params, value_std(state.value_stats), batched(env.step, mesh)
 
     def value(obs, carry):

@@ -12,6 +12,8 @@ from dexsim.core.pytree import align, pytree_dataclass, static
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
 # cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
 MEMORY = 2**27
+STD_FLOOR = 1e-2
+"""In observation units, of what a normaliser divides by: an entry that hardly varies is not blown up."""
 FIXED = -1
 """Count of statistics that no sample changes."""
 
@@ -53,24 +55,24 @@ def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, siz
     return RunningStats(count, jnp.where(ok, mean, stats.mean), jnp.where(ok, variance, stats.variance))
 
 
-def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_floor: float, clip: float) -> Normalizer:
-    """Normaliser of one observation group [n]; `std_floor` is in the observation's units.
+def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry]) -> Normalizer:
+    """Normaliser of one observation group [n].
 
     Entries with a fixed scale are only divided by it: with running statistics, a channel that is silent
     until first contact would see that contact as an outlier.
     """
     scale = np.concatenate([np.full(entry.size, entry.scale or 0.0, np.float32) for entry in layout])
-    std = jnp.sqrt(stats.variance + std_floor**2)
+    std = jnp.sqrt(stats.variance + STD_FLOOR**2)
     fixed = scale > 0
-    return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
+    return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std))
 
 
-def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
+def recover_stats(normalizer: Normalizer) -> RunningStats:
     """Statistics [n] from which `make_normalizer` makes this normaliser, for entries without a fixed scale.
 
     Fixed: other inputs would be another policy, sooner than a fine-tuning's small steps make up for.
     """
-    variance = jnp.maximum(normalizer.std**2 - std_floor**2, 0.0)
+    variance = jnp.maximum(normalizer.std**2 - STD_FLOOR**2, 0.0)
     return RunningStats(jnp.int32(FIXED), jnp.copy(normalizer.mean), variance)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.config import STD_MAX, STD_MIN, PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Normalizers, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.sharding import averaged
@@ -92,7 +92,7 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
     grads = Params(actor_grads, std_grads, critic_grads, memory_grads)
     params, moments = step_adam(grads, learner.adam, learner.params, learner.learning_rate)
     # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
-    log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
+    log_std = jnp.clip(params.log_std, jnp.log(STD_MIN), jnp.log(STD_MAX))
     params = dataclasses.replace(params, log_std=log_std)
     if config.critic_first:
         # Adam's moments follow the gradient from the start, so that the actor's first step is small. The critic keeps

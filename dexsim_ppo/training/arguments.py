@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-import numpy as np
-
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.hand.description import Hand
@@ -153,24 +151,17 @@ def printable(arguments: TrainArguments) -> dict[str, Any]:
 
 
 def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
-    """`config` with the policy's network and normaliser, little noise, small steps, and the critic alone at first.
+    """`config` with the policy's network, little noise, small steps, and the critic alone at first.
 
     A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
     policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
     """
     units = carry_size(policy.params.memory)
-    normalizer, floor = policy.params.normalizer, config.observation_std_floor
-    running = np.concatenate([np.full(entry.size, entry.scale is None) for entry in policy.observation_layout])
-    smallest = float(np.min(np.asarray(normalizer.std)[running], initial=floor))
-    if smallest < 0.999 * floor:  # Beyond rounding: a higher floor than that of its training would raise deviations.
-        floor = smallest
     return dataclasses.replace(
         config,
         memory="gru" if units else "none",
         memory_size=units or config.memory_size,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
-        observation_clip=normalizer.clip,
-        observation_std_floor=floor,
         learning_rate=1e-5,
         learning_rate_min=1e-6,
         learning_rate_max=5e-4,

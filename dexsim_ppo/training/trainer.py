@@ -89,7 +89,7 @@ class Run:
 
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
-        start = functools.partial(initialize_from, source, self.config) if isinstance(source, Policy) else None
+        start = functools.partial(initialize_from, source) if isinstance(source, Policy) else None
         training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh, start)
         key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
@@ -193,7 +193,7 @@ class Run:
         }
         if self.arguments.policy:
             origin["policy"] = self.arguments.policy
-        return Policy.from_training(self.evaluator.env, self.config, learner, origin)
+        return Policy.from_training(self.evaluator.env, learner, origin)
 
     def _evaluate(self, state: TrainState, iteration: int) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
@@ -309,11 +309,11 @@ class Faults:
             )
 
 
-def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+def initialize_from(policy: Policy, state: TrainState) -> TrainState:
     """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
     normalisation that it was trained with."""
     with jax.ensure_compile_time_eval():
-        stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+        stats = recover_stats(policy.params.normalizer)
     actor, memory = policy.params.layers, policy.params.memory
     return dataclasses.replace(
         state,

@@ -71,7 +71,7 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     save_calibration(output, calibration)
     operator.tell(f"calibration: {output}")
     if arguments.plot:
-        real, sim = ({name: getattr(found, side) for name, found in joints.items()} for side in ("real", "sim"))
+        real, sim = ({name: getattr(fitted, side) for name, fitted in joints.items()} for side in ("real", "sim"))
         plot_calibration(arguments.plot, calibration, real, sim)
         operator.tell(f"figure: {arguments.plot}")
 

@@ -25,7 +25,7 @@ from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter, Record, reading
 from dexsim_real.core.process import leave_realtime, use_realtime
-from dexsim_real.loop import ExchangeLoop, LoopOptions
+from dexsim_real.loop import ExchangeLoop, LoopConfig
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.link import UNCONFIRMED, HandPort, Identity
@@ -57,7 +57,7 @@ class PressConfig(Config):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CalibrateArguments(LoopOptions):
+class CalibrateArguments(LoopConfig):
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None

@@ -147,8 +147,8 @@ def joint_log(name: str, marks: Marks, hand: Hand, source: Source, calibration: 
     time = np.array([mark["sent"] for mark in marks])
     step, missing = np.median(np.diff(time)), time[-1] - time[0] - (len(time) - 1) * period
     if not abs(step - period) <= _OFF * period or not missing <= _LOST * len(time) * period:
-        found = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
-        raise LogError(f"exchanges took {found}: set the adapter's latency timer to 1 ms, or lower --rate")
+        timing = f"{1e3 * step:.1f} ms, expected {1e3 * period:.1f} ms; {1e3 * missing:.0f} ms are missing"
+        raise LogError(f"exchanges took {timing}: set the adapter's latency timer to 1 ms, or lower --rate")
     sensing, rows = HandSensing(hand, source.hardware, calibration), np.arange(len(marks))
     commands = np.array([mark["command"] for mark in marks])
     answers = [sensing.measure(sensing.decode(mark["answer"])) for mark in marks if mark["measured"]]

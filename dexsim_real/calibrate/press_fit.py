@@ -164,10 +164,10 @@ def fit(source: Source, recordings: Mapping[str, Recording], hand: Hand) -> tupl
     per_count, scales = force_scale(source, hand, [loaded[name] for name in blocks], notes)
     joints = dict[str, JointFit]()
     for name, part in blocks.items():
-        for label, found in _press(hand, loaded[name], part, scales[name], notes).items():
-            if label not in joints or found.lever > joints[label].lever:
-                joints[label] = found
-    real, sim = ({label: getattr(found, side) for label, found in joints.items()} for side in ("real", "sim"))
+        for label, fitted in _press(hand, loaded[name], part, scales[name], notes).items():
+            if label not in joints or fitted.lever > joints[label].lever:
+                joints[label] = fitted
+    real, sim = ({label: getattr(fitted, side) for label, fitted in joints.items()} for side in ("real", "sim"))
     try:
         calibration = calibrate(hand, real, sim, per_count, *source.identity)
     except CalibrationError as error:
@@ -209,8 +209,8 @@ def _press(hand: Hand, recording: Recording, part: Blocks, scale: Scale, notes: 
             notes.append(f"{label}: hardly moved while the {name} was pressed; press on something softer, more often")
             continue
         # A force read too large makes the gain of the current too small, and leaves the lever arm.
-        known, placed = float(np.hypot(error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
-        real = JointPress(force, part.current[:, joint], way, part.press, known)
+        gain_error, placed = float(np.hypot(error, _HEAT)), float(np.hypot(_LEVER, slip[joint]) / arm)
+        real = JointPress(force, part.current[:, joint], way, part.press, gain_error)
         fits[label] = JointFit(name, arm, real, JointPress(force, force * arms[:, joint], way, part.press, placed))
     if part.dead.any():
         which = f"{hand.finger_names[finger]}: dead: {taxel_names(hand, part.dead)}"
@@ -309,8 +309,8 @@ def force_scale(
             raise CalibrationError(f"{press.name}, gauge: counts do not follow its readings ({line.gain:.3g} per N)")
         error = float(np.hypot(line.gain_error / line.gain, _GAUGE))
         scales[press.name] = 1.0 / line.gain, -line.offset / line.gain, error
-        found = f"{line.gain:.3g} +- {line.gain * np.hypot(error, _PLACE):.2g} counts per newton by the gauge"
-        notes.append(f"{press.name}: {found} ({len(gauge)} readings), {line.offset:.1f} counts at zero force")
+        scale = f"{line.gain:.3g} +- {line.gain * np.hypot(error, _PLACE):.2g} counts per newton by the gauge"
+        notes.append(f"{press.name}: {scale} ({len(gauge)} readings), {line.offset:.1f} counts at zero force")
         own.setdefault(press.finger, 1.0 / line.gain)
     others = float(np.mean(list(own.values()))) if own else source.hardware.force_per_count
     per_count = np.array([own.get(finger, others) for finger in range(hand.num_fingers)])

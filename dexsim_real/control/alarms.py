@@ -155,15 +155,15 @@ class Alarms:
         if self._frozen.update(time, np.abs(goal - self._changed[1]).max() > _MOVED) > _UNNOTICED:
             text = "no joint angle changes while the commands move"
         ahead, before = goal - position, self._before
-        apart, moved = np.abs(ahead), before is None or position != before[1]
+        error, moved = np.abs(ahead), before is None or position != before[1]
         # A joint that draws current may press on something, as far as its commands lead. Beyond that it was taken.
-        led = apart if before is None else self._led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
-        self._led, self._before = np.clip(led, 0.0, apart), None if command is None else (command, position)
-        lost = (measured.current < _IDLE) | (apart - self._led > _FAR)
+        led = error if before is None else self._led + np.abs(goal - before[1]) - np.abs(np.subtract(*before))
+        self._led, self._before = np.clip(led, 0.0, error), None if command is None else (command, position)
+        lost = (measured.current < _IDLE) | (error - self._led > _FAR)
         # Nothing to press on keeps an angle from changing both ways: its encoder is stuck.
         self._ahead = np.where(moved, ahead, [np.minimum(self._ahead[0], ahead), np.maximum(self._ahead[1], ahead)])
         stuck = np.minimum(-self._ahead[0], self._ahead[1]) > _BOTH
-        lasts = self._away.update(time, (apart > _FAR) & lost | stuck)
+        lasts = self._away.update(time, (error > _FAR) & lost | stuck)
         joint = int(lasts.argmax())
         if not text and lasts[joint] > _UNNOTICED:
             text = (

@@ -117,10 +117,10 @@ class Controller:
     def check_measured(self, missing: Sequence[str]) -> None:
         """Raises HandError: the policy needs what the hand does not measure, names in `wire.driver.WITHOUT`."""
         names = select_fields(self.spec.fields, self.spec.observation)
-        wanted = {f"observes {name!r}": NEEDS.get(name, ()) for name in names}
-        if self.spec.force_loop:
-            wanted["corrects its command by the measured force"] = NEEDS["finger_force"]
-        for what, needs in wanted.items():
+        required = {f"observes {name!r}": NEEDS.get(name, ()) for name in names}
+        if self.spec.control.force.gain:
+            required["corrects its command by the measured force"] = NEEDS["finger_force"]
+        for what, needs in required.items():
             if lacking := [need for need in needs if need in missing]:
                 options = "--env.observation.leave-out, --env.control.force.gain 0"
                 raise HandError(f"the policy {what}, and the hand has no {lacking[0]}; train without it ({options})")
@@ -155,7 +155,7 @@ class Controller:
         }
         arrays: dict[str, Any] = {name: np.asarray(value, np.float32) for name, value in values.items()}
         readings = Readings(**arrays)
-        if self.spec.force_loop:
+        if self.spec.control.force.gain:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))

@@ -15,7 +15,7 @@ from dexsim.hand.description import Hand
 UNKNOWN = "the pose is not known: the last readings disagree, or are too few"
 _BEYOND = 0.1  # rad beyond a joint's limits up to which an angle is plausible
 _AGREEING = 10  # newest readings of a pose; fewer than half of them may be wrong by as much as they may differ
-_APART = 0.05  # rad, largest distance of these readings from their median
+_DEVIATION = 0.05  # rad, largest distance of these readings from their median
 _STILL = 0.01  # rad, largest motion of their median from the older half of them to the newer: no drift is a pose
 _NOW = 5  # newest readings whose median is the pose of a hand that moves
 _FASTER = 1.25  # largest joint speed, relative to the no-load speed of the model
@@ -44,8 +44,8 @@ class PoseCheck:
             return None
         readings = np.array(self._recent)
         median, older, newer = (np.median(part, axis=0) for part in (readings, readings[:_NOW], readings[_NOW:]))
-        apart, moved = np.abs(readings - median).max(), np.abs(newer - older).max()
-        return median if apart <= _APART and moved <= _STILL else None
+        deviation, moved = np.abs(readings - median).max(), np.abs(newer - older).max()
+        return median if deviation <= _DEVIATION and moved <= _STILL else None
 
     @property
     def newest(self) -> np.ndarray | None:

@@ -32,25 +32,25 @@ class FrameParser(Generic[T]):
         """Add received bytes; returns the frames that they complete. The last of a transmission if `final`: that drops
         an incomplete frame, and returns the frames inside its bytes."""
         self._buffer += data
-        buffer, found, at, done = self._buffer, list[T](), 0, 0
+        buffer, contents, at, done = self._buffer, list[T](), 0, 0
         while (at := buffer.find(self._head, at)) >= 0:
-            known = at + self._header <= len(buffer)
-            size = self._size(bytes(buffer[at : at + self._header])) if known else self._header
+            complete = at + self._header <= len(buffer)
+            size = self._size(bytes(buffer[at : at + self._header])) if complete else self._header
             end = at + size
             if end > len(buffer) and not final:
                 break
             content = None
-            if known and size and end <= len(buffer):
+            if complete and size and end <= len(buffer):
                 content = self._decode(bytes(buffer[at:end]))
                 self.damaged += content is None
             at += 1
             if content is not None:
                 self.frames += 1
-                found.append(content)
+                contents.append(content)
                 at = done = end
         else:
             # The last bytes may be the beginning of a head.
             parts = (size for size in range(len(self._head) - 1, 0, -1) if buffer.endswith(self._head[:size]))
             at = len(buffer) if final else max(len(buffer) - next(parts, 0), done)
         del buffer[:at]
-        return found
+        return contents

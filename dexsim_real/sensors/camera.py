@@ -18,7 +18,7 @@ import numpy as np
 
 from dexsim.core.config import Config, setting
 from dexsim.core.install import install_line
-from dexsim.task_spec import TaskSpec
+from dexsim.task_spec import VELOCITY_WEIGHT, TaskSpec
 from dexsim_real.core.errors import HandError, find_function
 from dexsim_real.core.process import BACKGROUND, change_priority
 from dexsim_real.sensors.imu import IDENTITY, ImuReader
@@ -98,7 +98,7 @@ class HeightSensor:
         axes = spec.object_axes
         if sum(axes) != 1:
             raise HandError(f"the policy observes the object's coordinates {axes}, and a camera measures one")
-        self._masks, self._config, self._weight = masks, config, spec.velocity_filter
+        self._masks, self._config = masks, config
         self._reference, self._axis = np.asarray(spec.reference, float), axes.index(True)
         self.newest = -math.inf, self._reference, np.zeros(3)
         """Time of the newest measurement (s, monotonic clock; -inf before the object was seen), position [3] m and
@@ -119,7 +119,7 @@ class HeightSensor:
         position = self._reference.copy()
         position[self._axis] = height
         # The first one has a velocity of 0: its difference took for ever.
-        self.newest = when, position, velocity + self._weight * ((position - place) / (when - before) - velocity)
+        self.newest = when, position, velocity + VELOCITY_WEIGHT * ((position - place) / (when - before) - velocity)
 
     def close(self) -> None:
         self._stop.set()

@@ -199,8 +199,8 @@ class HandSensing:
 
     def _say_wandered(self) -> list[str]:
         """A line, once, for each fingertip whose zeros have moved far since they were tared."""
-        known = np.isfinite(self.tare) & np.isfinite(self._tared)
-        moved = np.where(known, self.tare, 0.0).sum(1) - np.where(known, self._tared, 0.0).sum(1)
+        tared = np.isfinite(self.tare) & np.isfinite(self._tared)
+        moved = np.where(tared, self.tare, 0.0).sum(1) - np.where(tared, self._tared, 0.0).sum(1)
         new = (np.abs(moved) > _WANDERED) & ~self._advised
         self._advised |= new
         return [

@@ -108,10 +108,10 @@ class ImuReader:
                 # q and -q are one orientation: take the one nearer to the last, as in simulation.
                 self._newest, self._far = (time, quat if quat @ before >= 0 else -quat), 0
 
-    def calibrate(self, known: np.ndarray) -> None:
-        """Align: the object now has the orientation `known` [4] in the palm frame."""
+    def calibrate(self, true: np.ndarray) -> None:
+        """Align: the object now has the orientation `true` [4] in the palm frame."""
         assert self._newest is not None, "`wait` for the first orientation"
-        self._world = multiply(multiply(known, self._mount), conjugate(self._newest[1]))
+        self._world = multiply(multiply(true, self._mount), conjugate(self._newest[1]))
 
     def read(self) -> tuple[float, np.ndarray]:
         """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""

@@ -155,8 +155,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: twin.stop())
         calibration = Path(temporary) / "calibration.toml"  # for nominal motors, from which those of a trial deviate
-        known = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
-        save_calibration(calibration, known)
+        nominal = dataclasses.replace(ideal_calibration(hand), serial=SERIALS[hand.side], handedness=hand.side)
+        save_calibration(calibration, nominal)
         port = str(twin.line.terminal.name)
         command = ["python", "-m", "dexsim_real.run", arguments.task, "--port", port]
         command += ["--calibration", str(calibration), "--yes", *twin.sensor.option]

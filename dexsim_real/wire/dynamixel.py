@@ -128,12 +128,12 @@ class DynamixelHand(HandDriver):
         self.close()
         self._serial = open_serial(self.port, self.baud, timeout=_POLL, write_timeout=0.1)
         self._write(TORQUE, 0)  # Settings cannot be changed otherwise.
-        found = self._insist(SETTINGS)
-        wanted = found.copy()
-        wanted["return_delay"], wanted["operating_mode"] = 0, POSITION_BY_CURRENT
-        if not np.array_equal(found, wanted):
-            self._write(SETTINGS, wanted)
-            if not np.array_equal(self._insist(SETTINGS), wanted):
+        settings = self._insist(SETTINGS)
+        required = settings.copy()
+        required["return_delay"], required["operating_mode"] = 0, POSITION_BY_CURRENT
+        if not np.array_equal(settings, required):
+            self._write(SETTINGS, required)
+            if not np.array_equal(self._insist(SETTINGS), required):
                 raise HandError(f"{self.port}: the motors do not keep their operating mode; power-cycle the hand")
         self._limit = self._insist(CURRENT_LIMIT)["value"].astype(float)
         self._written, self._on, self._look = {}, False, 0

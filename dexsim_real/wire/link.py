@@ -166,8 +166,8 @@ class Identity(NamedTuple):
 def read_identity(serial_number: bytes, side: bytes) -> Identity:
     """The identity in the contents of the two registers; empty for one that the hand did not answer."""
     text = printable(serial_number)
-    known = [_WORDS[word] for word in (printable(side).lower(), text[:4].lower()) if word in _WORDS]
-    return Identity(text, known[0] if known else f"code {side[0]}" if side else "")
+    sides = [_WORDS[word] for word in (printable(side).lower(), text[:4].lower()) if word in _WORDS]
+    return Identity(text, sides[0] if sides else f"code {side[0]}" if side else "")
 
 
 def check_identity(identity: Identity, hand: Hand, calibration: Calibration | None = None) -> list[str]:
@@ -178,17 +178,17 @@ def check_identity(identity: Identity, hand: Hand, calibration: Calibration | No
     serial, side = identity
     if side in ("left", "right") and side != hand.side:
         raise HandError(f"this is a {side} hand (serial number {serial}), the model a {hand.side} one: see --hand")
-    known = (calibration.serial, calibration.handedness) if calibration else ("", "")
-    if known[0] and serial != known[0]:
+    expected = (calibration.serial, calibration.handedness) if calibration else ("", "")
+    if expected[0] and serial != expected[0]:
         this = f"this is hand {serial}" if serial else "the hand does not tell its serial number"
         todo = "calibrate this hand, or remove the file's serial number if it is this hand's"
-        raise HandError(f"{this}, the calibration is of hand {known[0]}: {todo}")
-    if known[1] and side and side != known[1]:
-        raise HandError(f"this hand is {side}, the calibration is of a {known[1]} one: calibrate this hand")
+        raise HandError(f"{this}, the calibration is of hand {expected[0]}: {todo}")
+    if expected[1] and side and side != expected[1]:
+        raise HandError(f"this hand is {side}, the calibration is of a {expected[1]} one: calibrate this hand")
     notes = []
     if not serial:
         notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
-    elif calibration and not known[0]:
+    elif calibration and not expected[0]:
         notes.append("the calibration names no serial number: it may be of another hand")
     if side.startswith("code"):
         notes.append(f"the hand gives its side as {side}, whose meaning is not known")

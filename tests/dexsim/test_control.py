@@ -11,7 +11,7 @@ import pytest
 
 from dexsim.control import Control, ForceLoop, correct_command, move_target, observed_action
 from dexsim.core.errors import ConfigError
-from dexsim.touch.reduce import ForceEstimate, estimate_force
+from dexsim.touch.reduce import estimate_force
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
 LOOP = ForceLoop(gain=0.5, limit=0.6)
@@ -101,10 +101,10 @@ def test_an_estimate_is_the_taxels_and_a_share_of_what_the_torque_adds_and_zero_
     gain = np.float32([8.0, 15.0, 13.0, 14.0, 15.0]) / hand.torque_limit[hand.root_joint]
     calibrated = dataclasses.replace(hand, force_per_torque=gain)
     for share, second in ((1.0, 3.0), (0.5, 1.75), (0.0, 0.5)):
-        found = estimate_force(ForceEstimate(torque_share=share), calibrated, taxels, torque)
+        found = estimate_force(share, calibrated, taxels, torque)
         np.testing.assert_allclose(found, [2.0, second, 0.0, 6.0, 0.0], rtol=1e-6)
     unknown = dataclasses.replace(hand, force_per_torque=np.zeros(5, np.float32))
-    np.testing.assert_allclose(estimate_force(ForceEstimate(), unknown, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
+    np.testing.assert_allclose(estimate_force(0.4, unknown, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
 
 
 def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_same_targets(

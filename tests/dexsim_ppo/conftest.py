@@ -3,7 +3,7 @@
 import jax
 import pytest
 import tiny_train
-from tiny_env import SMALL, TinyEnv, training_of
+from tiny_env import TinyEnv, training_of
 
 from dexsim_ppo.policy import Policy
 
@@ -19,4 +19,4 @@ def policy():
     """Of the integrator, hardly trained."""
     training = training_of()
     state, _ = training.step(training.init(jax.random.key(0)))
-    return Policy.from_training(TinyEnv(), SMALL, state, {"seed": 0})
+    return Policy.from_training(TinyEnv(), state, {"seed": 0})

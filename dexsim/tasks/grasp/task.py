@@ -220,10 +220,10 @@ class Grasp(Task):
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers, too_much = self._finger_joints, jnp.maximum(force[1:] - (target + _MARGIN), 0.0)
-        share, wanted = torque / self._max_torque, target / _FORCE_PER_TORQUE / self._max_torque
+        share, target_share = torque / self._max_torque, target / _FORCE_PER_TORQUE / self._max_torque
         pulling = contact & (torque >= 0.01)
         follows_force = command_reward(force, target, contact, (0.01, 200.0), config.max_force, weights)
-        follows_torque = command_reward(share, wanted, pulling, (0.0, 1.0), 1.0, weights)
+        follows_torque = command_reward(share, target_share, pulling, (0.0, 1.0), 1.0, weights)
         terms = {
             "force": held * weights.force * follows_force,
             "torque": held * weights.torque * follows_torque,

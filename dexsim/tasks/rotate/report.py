@@ -77,7 +77,7 @@ def _headline(report: dict) -> dict:
 def _counts(values: np.ndarray) -> dict:
     return {
         "mean": statistics.mean(values),
-        "median": statistics.median(values),
+        "median": statistics.interval(lambda rows: np.median(values[rows]), values.size, "median"),
         "percentiles": {str(q): float(np.percentile(values, q)) for q in _PERCENTILES},
         # Of very many an even selection.
         "sorted": np.sort(values)[np.linspace(0, values.size - 1, min(values.size, 100)).round().astype(int)].tolist(),

@@ -19,7 +19,7 @@ from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF
 _RANGE = 0.05  # rad, largest difference of an end of a joint's range
-_APART = 0.015  # m, largest distance of a fingertip from where the hand has it
+_DISTANCE = 0.015  # m, largest distance of a fingertip from where the hand has it
 _FREE, _HINGE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
 _IN_PAIRS = 1 << 30  # collision bit of geoms that otherwise touch by explicit pairs alone
 
@@ -127,8 +127,8 @@ def _find_joints(model: mujoco.MjModel, hand: Hand) -> list[int]:
         joint = hinges[name]
         limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.array([-np.inf, np.inf])
         if np.abs(limits - (low, high)).max() > _RANGE:
-            found, expected = f"{limits[0]:.3f} to {limits[1]:.3f} rad", f"{low:.3f} to {high:.3f}"
-            raise ValueError(f"joint {name} has a range of {found}, {end} of the hand {expected}")
+            actual, expected = f"{limits[0]:.3f} to {limits[1]:.3f} rad", f"{low:.3f} to {high:.3f}"
+            raise ValueError(f"joint {name} has a range of {actual}, {end} of the hand {expected}")
     return [hinges[name] for name in names]
 
 
@@ -173,10 +173,10 @@ def _check_places(model: mujoco.MjModel, hand: Hand, joints: list[int], palm: Po
         data.qpos[model.jnt_qposadr[joints]] = posture
         mujoco.mj_kinematics(model, data)
         expected, _ = _hand_tips(hand, posture)
-        apart = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - expected, axis=-1)
-        if not apart.max() <= _APART:
+        distance = np.linalg.norm((data.site_xpos[tips] - palm[0]) @ palm[1] - expected, axis=-1)
+        if not distance.max() <= _DISTANCE:
             where = f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad" if j >= 0 else "all joints at 0"
-            tip = f"the tip of {hand.finger_names[apart.argmax()]} is {1e3 * apart.max():.0f} mm"
+            tip = f"the tip of {hand.finger_names[distance.argmax()]} is {1e3 * distance.max():.0f} mm"
             todo = "check palm frame, and order, axes and zeros of the joints"
             raise ValueError(f"with {where} {tip} from where the hand has it: {todo}")
 

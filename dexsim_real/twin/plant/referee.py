@@ -140,8 +140,8 @@ class Referee:
         spin = abs(float(look.velocity @ self._axis))
         for name, fastest in _FASTEST.items():
             goal = turn(self._axis, self._heading + (self.goals[name] + 1) * self._start.turn)
-            apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], look.quat)[0]))))
-            self.goals[name] += apart < GOAL_ANGLE and away < GOAL_DISTANCE and spin <= fastest
+            angle = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], look.quat)[0]))))
+            self.goals[name] += angle < GOAL_ANGLE and away < GOAL_DISTANCE and spin <= fastest
 
     def report(self) -> dict[str, Any]:
         """Metrics so far; JSON-able.

@@ -22,7 +22,6 @@ QUIET = Sensing(
     torque_noise=0.0,
     object_noise=0.0,
     object_axes=(True, False, True),
-    velocity_filter=0.3,
     orientation=ImuConfig(noise=0.0),
 )
 LEVEL = jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -97,7 +96,7 @@ def test_only_the_measured_coordinates_move_and_their_velocity_is_filtered(hand,
         found = read(QUIET, now, last, age=0.0)
         np.testing.assert_allclose(found.object_position, [height, reference[1], 2 * height], rtol=1e-5)
         if k:
-            velocity += 0.3 * ((height - heights[k - 1]) / period - velocity)
+            velocity += 0.5 * ((height - heights[k - 1]) / period - velocity)
         np.testing.assert_allclose(found.object_velocity, [velocity, 0.0, 2 * velocity], rtol=1e-4, atol=1e-6)
         last = found, now
 

@@ -1,6 +1,8 @@
 """A task written from `dexsim.env.task.Task` alone: balance a ball on the upturned palm."""
 
 import dataclasses
+import pydoc
+import re
 from types import SimpleNamespace
 
 import jax
@@ -25,7 +27,9 @@ from dexsim.env.task import reward_of
 from dexsim.geometry import grid, surface_points
 from dexsim.geometry.distance import signed_distance
 from dexsim.geometry.mesh import load_mesh
+from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams
+from dexsim.touch.taxel_force import Touch
 
 WORLDS = 4
 
@@ -147,3 +151,15 @@ def test_a_reward_may_be_any_number(reward):
         task.reward = lambda *_, given=given: given
         with pytest.raises(ConfigError, match=f"task 'balance': {name} must be a scalar; got shape"):
             reward_of(task, None, None, jnp.zeros((), bool))
+
+
+READ = [dexsim.GroundTruth, dexsim.State, dexsim.Start, dexsim.Readings, dexsim.Task, dexsim.TaskSpec]
+
+
+@pytest.mark.parametrize("cls", [*READ, HandPose, ObjectParams, Touch])
+def test_help_shows_what_a_field_is_and_the_shape_or_unit_of_numbers(cls):
+    page = pydoc.render_doc(cls, renderer=pydoc.plaintext)
+    texts = dict(re.findall(r"^ \|    (\w+): (.+)$", page, re.M)) | {"kinds": "not traced"}
+    for name, kind in cls.__annotations__.items():
+        number = re.search(r"array|float|\bint\b", str(kind), re.I)
+        assert re.search(r"\[.*\]|ticks", texts[name]) if number else texts[name], name

@@ -15,7 +15,7 @@ from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.posture import find_grasp
-from dexsim.hand.vendor import ImportOptions, read_hand
+from dexsim.hand.vendor import ImportConfig, read_hand
 from dexsim.randomization import Randomization, sample_hand
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
@@ -23,7 +23,7 @@ from dexsim.tasks.grasp.task import Grasp
 TURN = Rotation.from_euler("xyz", [0.4, -0.9, 2.1]).as_matrix()  # of the file's palm against ours
 ROOTS = {"index": (0, 0.035, 0.09), "middle": (0, 0.01, 0.095), "ring": (0, -0.015, 0.09), "thumb": (0.01, 0.05, 0.02)}
 LENGTHS = (0.04, 0.03)
-PLAIN = ImportOptions()
+PLAIN = ImportConfig()
 
 
 def urdf(folder, *, reverse=(), turn=TURN, effort="0.6", mirror=False):
@@ -175,7 +175,7 @@ def mjcf(folder, tail="", bodies=("thumb", "f", "g")):
 
 def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
     path = mjcf(tmp_path, TENDON + '<equality><tendon tendon1="cord"/></equality>')
-    options = ImportOptions(drop_tendons=True, couple=("f_b=f_a:0.7",))
+    options = ImportConfig(drop_tendons=True, couple=("f_b=f_a:0.7",))
     (follower,) = (link for link in read_hand(path, options).links if link.leader)
     assert (follower.joint, follower.leader, follower.ratio) == ("f_b", "f_a", 0.7)
 
@@ -193,13 +193,13 @@ REFUSED = {
 def test_what_cannot_be_imported_is_one_line(tmp_path, what):
     file, options, says = REFUSED[what]
     with pytest.raises(AssetError, match=says):
-        read_hand(mjcf(tmp_path, **file), ImportOptions(**options))
+        read_hand(mjcf(tmp_path, **file), ImportConfig(**options))
 
 
 def test_the_frame_is_confirmed(tmp_path):
     with pytest.raises(ConfigError, match="not a terminal: --yes accepts"):
         import_hand.main([str(mjcf(tmp_path)), "--out", str(tmp_path)])
-    options = ImportOptions(fingers=(0, 0, 2), normal=(-1, 0, 0.1))
+    options = ImportConfig(fingers=(0, 0, 2), normal=(-1, 0, 0.1))
     draft = read_hand(mjcf(tmp_path), options)
     orient(draft, options)
     (link,) = (link for link in draft.links if link.joint == "f_a")
@@ -213,7 +213,7 @@ def test_joints_without_a_range_are_named_and_show_no_palm_side(tmp_path, given)
     draft = read_hand(path, PLAIN)
     assert sum("no range in the file" in line for line in draft.findings) == 6
     with pytest.raises(AssetError, match="no palm side found"):
-        orient(draft, ImportOptions(**given))
+        orient(draft, ImportConfig(**given))
 
 
 def test_meshes_in_millimetres_are_an_error(tmp_path):

@@ -83,9 +83,9 @@ def test_sizes_fill_their_ranges():
     within(union.size[:, CAPSULE, 1], config.neck_half)
     boxy = union.active[:, BOX]
     assert 0.3 < boxy.mean() < 0.7
-    within(union.size[boxy, BOX], config.box_half, config.composition_scale)
-    within(union.size[~boxy, CYLINDER, 0], config.cylinder_radius, config.composition_scale)
-    within(union.size[~boxy, CYLINDER, 1], config.cylinder_half, config.composition_scale)
+    within(union.size[boxy, BOX], config.box_half, 0.8)
+    within(union.size[~boxy, CYLINDER, 0], config.cylinder_radius, 0.8)
+    within(union.size[~boxy, CYLINDER, 1], config.cylinder_half, 0.8)
 
 
 @pytest.mark.parametrize(

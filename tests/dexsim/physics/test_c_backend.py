@@ -25,8 +25,9 @@ from dexsim.physics.physics import Physics
 WORLDS = 8
 
 
-def make(hand, **changes):
-    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=GRAVITY, backend="c")
+def make(hand, cover=0.003, **changes):
+    config = PhysicsConfig(**changes)
+    return Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="c", pad_thickness=cover)
 
 
 def hold(index, position, velocity):
@@ -197,7 +198,7 @@ THICK, THIN = 0.003, 0.001
 @pytest.fixture(scope="module")
 def scenes(hand):
     """{thickness compiled in: scene} on C MuJoCo."""
-    return {cover: make(hand, pad_thickness=cover) for cover in (THICK, THIN, 0.0)}
+    return {cover: make(hand, cover) for cover in (THICK, THIN, 0.0)}
 
 
 @pytest.fixture(scope="module")

@@ -30,13 +30,10 @@ CONFIG = dataclasses.replace(
     minibatches=1,
     clip_ratio=0.15,
     value_clip=0.1,
-    value_coefficient=0.7,
     entropy_coefficient=0.3,
     bounds_coefficient=0.4,
     discount=0.9,
     gae_lambda=0.8,
-    observation_clip=1.2,
-    observation_std_floor=0.3,
 )
 
 
@@ -76,7 +73,7 @@ def setting(seed, **options):
     change = lambda size: jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape), x.dtype), params)  # noqa: E731
     params = jax.tree.map(jnp.add, params, change(0.4))
     single = lambda *x: RunningStats(jnp.int32(30), *(jnp.asarray(v, jnp.float32) for v in x))  # noqa: E731
-    stats = {g: single(rng.normal(size=4), rng.uniform(0.2, 3, 4)) for g in Script.observation_layout}
+    stats = {g: single(rng.normal(size=4), rng.uniform(0.02, 3, 4)) for g in Script.observation_layout}
     return Script(rng), config, params, stats, single(0.7, 16.0), change(0.15)
 
 
@@ -94,7 +91,7 @@ def experience(script, config, params, stats, value_stats, key):
             key=key,
             **dict.fromkeys(("average", "adam", "learning_rate", "iteration", "skipped_updates")),
         )
-        normalizers = ppo.make_normalizers(script, config, stats)
+        normalizers = ppo.make_normalizers(script, stats)
         _, rollout, _ = ppo.collect_rollout(script, config, state)
         samples, state, explained = ppo.prepare(config, state, rollout)
         start = state.params
@@ -124,9 +121,9 @@ class Reference:
     def seen(self, group, obs):
         """Normalised observation [..., n]."""
         scale = np.concatenate([[field.scale or np.nan] * field.size for field in self.layout[group]])
-        spread = np.hypot(np.sqrt(self.stats[group].variance), self.config.observation_std_floor)
+        spread = np.hypot(np.sqrt(self.stats[group].variance), 0.01)
         z = np.where(np.isnan(scale), (obs - self.stats[group].mean) / spread, obs / scale)
-        return np.clip(z, -self.config.observation_clip, self.config.observation_clip)
+        return np.clip(z, -5.0, 5.0)
 
     def network(self, layers, x):
         for layer in layers[:-1]:
@@ -177,7 +174,7 @@ class Reference:
         value_loss = 0.5 * np.max(errors, 0)
         bounds = np.sum(np.maximum(np.abs(mean) - 1.1, 0.0) ** 2, -1)
         entropy = np.sum(np.log(std) + 0.5 * math.log(2 * math.pi * math.e))
-        losses = -advantage * bounded + c.value_coefficient * value_loss + c.bounds_coefficient * bounds
+        losses = -advantage * bounded + value_loss + c.bounds_coefficient * bounds
         return losses.mean() - c.entropy_coefficient * entropy
 
     def divergence(self, params):

@@ -40,16 +40,16 @@ def test_reaches_the_known_return(trained):
 def test_a_good_policy_is_not_worse_in_another_world(trained):
     """The return falls when the critic learns at the policy's small rate: the policy climbs its errors. Observations
     keep their normalisation, which many steps of a GPU would change wholly."""
-    policy = Policy.from_training(TinyEnv(), CONFIG, trained[0])
+    policy = Policy.from_training(TinyEnv(), trained[0])
     config = dataclasses.replace(fine_tuning_config(policy, CONFIG), discount=0.99, critic_first=50)
-    start = functools.partial(initialize_from, policy, config)
+    start = functools.partial(initialize_from, policy)
     training = ppo.make_train(TinyEnv(TinyConfig(gain=0.1, horizon=64)), config, start=start)
     state, returns = training.init(jax.random.key(1)), []
     for _ in range(25):
         state, metrics = training.step(state)
         returns.append(np.nanmean(metrics["episode/return"]))
     assert np.mean(returns[-5:]) > np.mean(returns[:5]) - 0.5
-    new = Policy.from_training(TinyEnv(), CONFIG, state).params.normalizer
+    new = Policy.from_training(TinyEnv(), state).params.normalizer
     np.testing.assert_array_equal(new.mean, policy.params.normalizer.mean)
     np.testing.assert_allclose(new.std, policy.params.normalizer.std, rtol=1e-6)
 
@@ -65,7 +65,7 @@ def test_the_average_is_over_about_the_last_tenth():
     weights = [math.comb(i + 9, 9) for i in range(12)]
     expected = np.average(kernels, axis=0, weights=weights)
     np.testing.assert_allclose(state.average[0][0].kernel, expected, rtol=1e-4, atol=1e-6)
-    policy = Policy.from_training(TinyEnv(), SMALL, state)
+    policy = Policy.from_training(TinyEnv(), state)
     np.testing.assert_array_equal(policy.params.layers[0].kernel, state.average[0][0].kernel)
 
 
@@ -105,7 +105,7 @@ def test_metrics_are_those_of_a_plain_loop_and_a_diverging_world_poisons_nothing
         (after, _), rollout, metrics = ppo.collect_rollout(env, config, state)
         samples, learnt, explained = ppo.prepare(config, state, rollout)
         batch = samples, learnt.params, learnt.value_stats, learnt.observation_stats, explained
-        normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+        normalizers = ppo.make_normalizers(env, state.observation_stats)
         return after.key, rollout, metrics, batch, critic_value(config, state.params, normalizers, rollout.obs)
 
     keys, rollout, metrics, learnt_from, value = collect(state)

@@ -85,7 +85,7 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     state = training.init(jax.random.key(0))
     for _ in range(8):  # 80 iterations
         state, _ = training.step(state)
-    policy = Policy.from_training(env, config, state)
+    policy = Policy.from_training(env, state)
     report = evaluate_policy(policy, env=env, episodes=256)
     error = report["task"]["headline"]["error"]
     # The mean of |number| is 0.5, and the first of six steps shows it.
@@ -101,7 +101,7 @@ def test_every_episode_begins_with_an_empty_memory_and_only_then():
     assert np.abs(later[~ended]).max(-1).min() > 0
     env, config, _, state = learner("gru")
     seen = jax.tree.map(jnp.asarray, dataclasses.replace(samples, first=samples.first > 0))
-    mean = actor_mean(config, state.params, ppo.make_normalizers(env, config, state.observation_stats), seen)
+    mean = actor_mean(config, state.params, ppo.make_normalizers(env, state.observation_stats), seen)
     np.testing.assert_allclose(mean, samples.decision.mean, atol=1e-6, err_msg="the update replays what was done")
     assert samples.first.any()
 
@@ -124,7 +124,7 @@ def test_gradients_go_back_through_the_rollout():
     """A step's error reaches what an earlier observation did, but not across an episode's start."""
     env, config, _, state = learner("gru")
     *_, samples = experience("gru")
-    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+    normalizers = ppo.make_normalizers(env, state.observation_stats)
 
     def last(obs, first):
         changed = dataclasses.replace(samples, obs={"actor": obs}, carry=jnp.asarray(samples.carry), first=first)

@@ -15,7 +15,7 @@ from dexsim.calibration.maps import (
     torque_constants,
 )
 from dexsim.core.errors import CalibrationError
-from dexsim.touch.reduce import ForceEstimate, estimate_force
+from dexsim.touch.reduce import estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.calibrate.press_fit import fit, read_presses
@@ -65,7 +65,7 @@ def test_the_force_over_the_root_joints_torque_comes_back(hand, session):
     taxels = np.zeros((5, hand.num_taxels))
     taxels[1, 50] = 1.0
     read = normalised_torque(calibration, current)
-    force = estimate_force(ForceEstimate(torque_share=1.0), calibrated_hand(hand, calibration), taxels, read)[1]
+    force = estimate_force(1.0, calibrated_hand(hand, calibration), taxels, read)[1]
     friction = calibration.real.friction[4] / abs(np.mean(calibration.real.gain[:, 4]))
     assert abs(float(force) - 6.0) < friction * 1.3 + 0.3
 
