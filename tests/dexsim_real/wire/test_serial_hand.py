@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 from emulated_plant import motors
-from pty_hand import QUICK, Clock, PtyHand, connect_in_memory
+from pty_hand import QUICK, PtyHand, connect_in_memory
+from virtual_time import VirtualTime
 
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
@@ -28,7 +29,7 @@ serial = pytest.importorskip("serial")
 
 def memory_port(monkeypatch, peer, config=QUICK):
     """A port to this hand over a line in memory, and the clock of both."""
-    clock = Clock()
+    clock = VirtualTime()
     connect_in_memory(monkeypatch, peer, clock)
     port = SerialHand("loop://", config)
     port._open()
@@ -176,7 +177,7 @@ def test_answers_that_come_too_soon_or_too_late_are_told(monkeypatch):
     for version, delay in ((b"1", 0.0), (None, 0.113), (None, 0.15)):
         peer = PtyHand(version=version)
         peer.delay = delay
-        connect_in_memory(monkeypatch, peer, Clock())
+        connect_in_memory(monkeypatch, peer, VirtualTime())
         with pytest.raises(HandError, match="too late; raise --link.margin.*--link.no-paced"):
             SerialHand("loop://", dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)).connect()
 
