@@ -36,7 +36,7 @@ class PtyHand:
         self.state["joint"]["temperature"] = 30
         self.commands: list[np.ndarray] = []
         self.delay = 0.0  # s, of the next answer on a line in memory
-        self.port, self._folder = "", tempfile.TemporaryDirectory()
+        self.port, self._folder, self._stop = "", tempfile.TemporaryDirectory(), threading.Event()
 
     def __enter__(self):
         self.open()
@@ -107,6 +107,8 @@ class MemoryLine:
         return there, [(when, data) for when, data in self.coming if when > now]
 
     def write(self, data):
+        if self.peer._stop.is_set():
+            raise OSError("the cable is out")
         for frame in self.parser.feed(bytes(data)):
             reply = self.peer.reply(frame)
             self.coming.append((self.clock.monotonic() + self.peer.delay, reply))

@@ -4,7 +4,6 @@ import dataclasses
 import errno
 import re
 import termios
-import time
 
 import numpy as np
 import pytest
@@ -271,13 +270,13 @@ def test_another_hand_is_refused_in_one_line_and_what_is_unknown_is_told(hand):
     ("back", "says"),
     [(b"2R32A001", ""), (b"2R32B002", "2R32B002, not right, serial number 2R32A001"), (None, "unknown")],
 )
-def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
+def test_after_a_reconnection_only_the_same_hand_is_driven(hand, virtual_time, back, says):
     """Cable out while the motors are on; what comes back may be another hand, or not tell. Both end the run."""
     peer = PtyHand(registers={20: b"right", 21: b"2R32A001"})
     peer.state["joint"]["position"] = np.array([0.1] * 3 + [0.0] + [0.1] * 8)
     peer.open()
     port, safety = SerialHand(peer.port, QUICK), Safety(hand, SafetyConfig())
-    loop = LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 83.0)
+    loop = LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 83.0, clock=virtual_time.monotonic)
     port.connect()
     for _ in range(10):  # A pose needs as many.
         loop.cycle()
@@ -289,8 +288,8 @@ def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
     peer.commands.clear()
     peer.registers = {20: b"right", 21: back} if back else {}
     peer.open()
-    until = time.monotonic() + 20
-    while time.monotonic() < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
+    until = virtual_time.now + 20
+    while virtual_time.now < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
         loop.cycle()
     driven = any(np.any(command["mode"] != Mode.PASSIVE) for command in peer.commands)
     # The first answer of the new generation is from a passive hand: its pose may have changed.
