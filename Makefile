@@ -5,6 +5,7 @@
 #   make docs                         the documentation site, in site/
 #   make figures                      the pictures of the documentation, anew; ARGS="skin films" for some
 #   make test ARGS="-k touch"         options of pytest (which runs on two processes)
+#   make test MORE=,sb3               further extras whose tests are skipped otherwise
 #   make mutants ARGS="--seed 1"      an hour of small changes in the code: do the tests notice?
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
 #   make EXTRAS=cuda train       other extras than the ones chosen by the device found
@@ -12,6 +13,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 ARGS ?=
+MORE ?=
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 
@@ -21,7 +23,7 @@ comma := ,
 
 # One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.
 INSTALLED := $(VENV)/.installed-$(subst $(comma),-,$(EXTRAS))
-TESTABLE := $(VENV)/.testable
+TESTABLE := $(VENV)/.testable$(subst $(comma),-,$(MORE))
 DOCUMENTABLE := $(VENV)/.documentable
 LINTABLE := $(VENV)/.lintable
 MUTABLE := $(VENV)/.mutable
@@ -72,7 +74,7 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[train,brax,video,tb,onnx,lerobot,gym,docs]" --group test
+	$(PIP) install --quiet --editable ".[train,brax,video,tb,onnx,lerobot,gym,docs$(MORE)]" --group test
 	@touch $@
 
 $(MUTABLE): $(TESTABLE)

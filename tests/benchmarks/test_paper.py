@@ -41,28 +41,6 @@ def test_smoke(paper, tmp_path, monkeypatch, name):
     assert again == {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
 
 
-def test_rows_and_seeds_go_on_where_they_stopped(paper, tmp_path):
-    calls, stops = [], [("b", 1)]
-
-    def measure(row, seed, budget, work):
-        if (row.name, seed) in stops:
-            raise KeyboardInterrupt
-        calls.append((row.name, seed))
-        return {"value": len(calls)}
-
-    rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
-    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "training_seeds": 3}
-    experiment, budget = paper.data.Experiment(rows=rows, measure=measure, **given), paper.data.BUDGETS["cpu"]
-    with pytest.raises(KeyboardInterrupt):
-        paper.command.run(experiment, budget, tmp_path, tmp_path / "work")
-    assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 0)]
-    stops.clear()
-    paper.command.run(experiment, budget, tmp_path, tmp_path / "work")
-    assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
-    report = json.loads((tmp_path / "stub" / "b" / "report.json").read_text())
-    assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
-
-
 def test_settings_of_all_rows_are_of_their_tasks(paper):
     """What would otherwise fail after an hour: a field's name, a value out of range, a field that is not observed."""
     from dexsim.core.config import from_dict, override, to_dict

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from virtual_time import VirtualTime
 
 from dexsim import load_hand
 from dexsim_real.control.controller import Controller
@@ -34,3 +35,11 @@ def jax_as_it_is(monkeypatch, controller_of):
     monkeypatch.setattr("dexsim_real.run.Controller", controller_of)
     monkeypatch.setattr("dexsim_real.run.prepare_jax", lambda: None)
     monkeypatch.setattr("dexsim_real.replay.prepare_jax", lambda: None)
+
+
+@pytest.fixture
+def virtual_time(monkeypatch):
+    """Runs in virtual time."""
+    clock = VirtualTime()
+    clock.install(monkeypatch)
+    return clock

@@ -3,7 +3,6 @@ safety, and how it ends."""
 
 import dataclasses
 import sys
-import time
 import types
 from types import SimpleNamespace
 
@@ -194,16 +193,16 @@ def test_a_hand_without_taxels_or_currents_publishes_what_it_has(make, leap):
 
 
 @pytest.mark.parametrize("way", [KeyboardInterrupt, RuntimeError])
-def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, leap, way):
+def test_whatever_ends_the_node_turns_the_motors_off(monkeypatch, virtual_time, leap, way):
     """The command itself, with its thread."""
     driver = follower(leap)
     monkeypatch.setitem(sys.modules, "my_sdk", SimpleNamespace(open_hand=lambda hand, config: driver))
-    node = Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard --safety.stale 2")
+    node = Node("n", port="sdk:my_sdk", hand="leap_like", options="--no-guard")
 
     def spin(node):
         node.services["~/motors"](SimpleNamespace(data=True), SimpleNamespace())
         while not driver.on:
-            time.sleep(0.01)
+            virtual_time.sleep(0.01)
         raise way("the end")
 
     install(monkeypatch, node, spin)

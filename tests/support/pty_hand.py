@@ -5,7 +5,6 @@ import os
 import select
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +36,7 @@ class PtyHand:
         self.state["joint"]["temperature"] = 30
         self.commands: list[np.ndarray] = []
         self.delay = 0.0  # s, of the next answer on a line in memory
-        self.port, self._folder = "", tempfile.TemporaryDirectory()
+        self.port, self._folder, self._stop = "", tempfile.TemporaryDirectory(), threading.Event()
 
     def __enter__(self):
         self.open()
@@ -90,23 +89,10 @@ class PtyHand:
         return Frame(0x80, 0xFE, Command.EXCHANGE, self.state.tobytes()).encode()
 
 
-class Clock:
-    """In place of the module `time`: only waiting passes its time."""
-
-    def __init__(self):
-        self.now = 1000.0
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.now += seconds
-
-
 class MemoryLine:
     """What pyserial gives the host. The hand answers `peer.delay` s after the request."""
 
-    def __init__(self, peer: PtyHand, timeout: float, clock=time):
+    def __init__(self, peer: PtyHand, timeout: float, clock):
         self.peer, self.timeout, self.clock = peer, timeout, clock
         self.parser, self.coming = Parser(HOST_REQUESTS), []  # (time at which it is there, bytes)
 
@@ -121,6 +107,8 @@ class MemoryLine:
         return there, [(when, data) for when, data in self.coming if when > now]
 
     def write(self, data):
+        if self.peer._stop.is_set():
+            raise OSError("the cable is out")
         for frame in self.parser.feed(bytes(data)):
             reply = self.peer.reply(frame)
             self.coming.append((self.clock.monotonic() + self.peer.delay, reply))
@@ -137,7 +125,7 @@ class MemoryLine:
         pass
 
 
-def connect_in_memory(monkeypatch, peer, clock=time):
+def connect_in_memory(monkeypatch, peer, clock):
     """Every port that opens from now on is a line to this hand, and the driver's clock is this one."""
     monkeypatch.setattr("serial.serial_for_url", lambda url, timeout, **_: MemoryLine(peer, timeout, clock))
     monkeypatch.setattr("dexsim_real.wire.link.time", clock)

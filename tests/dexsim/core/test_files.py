@@ -1,7 +1,6 @@
 """Files: whole or not at all, and none that is read is replaced."""
 
 import errno
-import json
 import os
 import re
 from pathlib import Path
@@ -55,28 +54,3 @@ def test_a_write_that_fails_leaves_the_file_before_it(tmp_path):
     with pytest.raises(OSError, match=re.escape(f"the disk is full: '{tmp_path}/file'")):
         write_atomic(tmp_path / "file", chunks())
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
-
-
-@pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o444])
-def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mode):
-    (tmp_path / "old").write_text("1")
-    (tmp_path / "old").chmod(mode)
-    (tmp_path / "other").write_text("1")
-    for name in ("old", "new"):
-        write_atomic(tmp_path / name, [b"2"])
-    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
-    assert modes == {"old": mode, "new": modes["other"], "other": modes["other"]}
-
-    def chunks():
-        (temporary,) = tmp_path.glob(".old.*.dexsim-part")
-        assert temporary.stat().st_mode & 0o077 == 0, "nobody else reads what is being written"
-        yield b"3"
-
-    write_atomic(tmp_path / "old", chunks())
-
-
-def test_json_reads_back_and_has_a_list_of_numbers_on_one_line(tmp_path):
-    data = {"text": ["[\n 1\n]", 'x, "y"'], "nested": [[1.5, None], {"a": []}]}
-    cli.write_json(tmp_path / "a.json", data)
-    text = (tmp_path / "a.json").read_text()
-    assert json.loads(text) == data and "[1.5, null]" in text

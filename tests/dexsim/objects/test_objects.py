@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from shapes import bounds, integrate
 
-from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
-from dexsim.objects.params import extent, sample_object, unit_inertia
+from dexsim.objects.config import SHAPES, ObjectConfig
+from dexsim.objects.params import extent, sample_object
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {
@@ -86,32 +86,6 @@ def test_sizes_fill_their_ranges():
     within(union.size[boxy, BOX], config.box_half, 0.8)
     within(union.size[~boxy, CYLINDER, 0], config.cylinder_radius, 0.8)
     within(union.size[~boxy, CYLINDER, 1], config.cylinder_half, 0.8)
-
-
-@pytest.mark.parametrize(
-    ("shapes", "slots"),
-    [
-        (("sphere",), ("capsule",)),
-        (("box",), ("box",)),
-        (("cylinder", "sphere"), ("capsule", "cylinder")),
-        (("composition",), SLOTS),
-        (SHAPES, SLOTS),
-    ],
-)
-def test_a_template_has_the_slots_of_its_shapes_and_the_same_objects(shapes, slots):
-    config, kept = ObjectConfig(shapes=shapes), [SLOTS.index(slot) for slot in slots]
-    np.testing.assert_array_equal(config.largest, ObjectConfig().largest[kept])
-    for name in shapes:
-        few, all = draw(config, name), default(name)
-        assert config.slots == few.kinds == slots and not np.delete(all.active, kept, axis=1).any()
-        for field in ("size", "active"):
-            np.testing.assert_array_equal(getattr(few, field), getattr(all, field)[:, kept])
-        np.testing.assert_allclose(few.position, all.position[:, kept], atol=1e-9)
-        for field in ("mass", "com", "friction", "contact"):
-            np.testing.assert_array_equal(getattr(few, field), getattr(all, field))
-        np.testing.assert_allclose(few.inertia, all.inertia, rtol=1e-6)
-        plain = jax.vmap(functools.partial(unit_inertia, config=config))(few)
-        np.testing.assert_allclose(plain, jax.vmap(unit_inertia)(all), rtol=1e-6)
 
 
 def test_extent_is_the_bound_of_the_turned_shape():

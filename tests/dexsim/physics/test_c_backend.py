@@ -10,6 +10,7 @@ import sys
 import c_scene
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from c_scene import GRAVITY, row, rows_of, squeeze, stack
@@ -94,6 +95,28 @@ class TestForces:
         _, force = step(target, state, torque)
         _, expected = one_step(target, state, torque, jnp.zeros((len(grips), 3)))
         np.testing.assert_allclose(force, expected, atol=0.1)
+
+
+def test_an_object_slides_on_the_palm_as_in_a_second_scene_and_as_coulomb_says(hand, tick, grips):
+    """A box at 0.6 m/s over a level palm. What slows it is the friction times the impulse of the palm, which weight and
+    bounce give; the fingertips' friction has no part in it."""
+    friction, velocity = 0.3, np.zeros(18, np.float32)
+    given = grips[WORLDS * SHAPES.index("box")][0].object
+    box = dataclasses.replace(given, friction=np.float32(1.1), link_friction=np.float32(friction), com=0 * given.com)
+    pose, velocity[13:15] = np.float32([0.02 + box.size[0, 0], -0.02, 0.09, 1, 0, 0, 0]), (0.36, -0.48)
+    state = stack([PhysicsState(np.append(np.zeros(12, np.float32), pose), velocity, 0 * velocity)])
+    model = c_scene.compile_scene(hand, box, **c_scene.CONVERGED)
+    model.opt.gravity[:] = -model.opt.gravity
+    data = c_scene.start(model, state.qpos[0], velocity)
+    push = -2 * box.mass * np.float32([GRAVITY])  # The engine's scene has the palm above.
+    for k in range(1, 10):
+        data.qpos[:12] = data.qvel[:12] = 0
+        mujoco.mj_step(model, data)
+        if k % 3 == 0:
+            state, _ = tick(stack([box]), state, push)
+            np.testing.assert_allclose(state.qvel[0, 12:], data.qvel[12:], atol=1e-3)
+    impulse = 9.81 * data.time + data.qvel[12]
+    assert np.linalg.norm(state.qvel[0, 13:15]) == pytest.approx(0.6 - friction * impulse, abs=1e-3)
 
 
 def test_batches_of_any_size_and_order_loops_and_scans_give_the_same_bits(physics, tick, grips):

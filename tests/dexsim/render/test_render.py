@@ -130,21 +130,3 @@ def test_a_film_of_another_rate_keeps_its_duration(recorded, tmp_path, monkeypat
     empty = steps.map(operator.itemgetter(slice(0)))
     with pytest.raises(ValueError, match="no snapshots"):
         render.render_episode(env, empty, tmp_path / "none.gif", fps=30)
-
-
-def test_a_film_that_fails_leaves_the_one_before_it(recorded, tmp_path, monkeypatch):
-    ffmpeg, path = pytest.importorskip("imageio_ffmpeg"), tmp_path / "video.mp4"
-    path.write_text("the one before it")
-    env, steps = episode(recorded, 3)
-    monkeypatch.setattr(ffmpeg, "write_frames", truncated)
-    with pytest.raises(OSError) as error:
-        render.render_episode(env, steps, path, fps=20, size=(160, 120))
-    assert "\n" not in str(error.value) and path.read_text() == "the one before it"
-    assert [other.name for other in tmp_path.iterdir()] == ["video.mp4"]
-
-
-def truncated(path, *_, **__):
-    """An encoder on a full disk, which says nothing."""
-    with open(path, "wb") as file:
-        while True:
-            file.write(b"ftyp" if (yield) is None else b"")

@@ -3,8 +3,6 @@
 import dataclasses
 import subprocess
 import sys
-import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -134,6 +132,8 @@ def test_the_demo_shows_recorded_episodes_without_jax():
 import itertools
 from dexsim.view import __main__ as demo, viewer
 class Page(viewer.Viewer):
+    def __init__(self, *parts, port, **more):
+        super().__init__(*parts, port=0, **more)
     def run(self):
         ticks = sum(len(episode.seconds) for episode in self.source._episodes)
         frames = list(itertools.islice(viewer.frames_of(self.source), ticks))
@@ -145,7 +145,7 @@ class Page(viewer.Viewer):
         self.server.stop()
 viewer.Viewer = Page
 for name in {recorded}:
-    demo.main([name, "--port", "18090"])
+    demo.main([name])
 """
     done = subprocess.run([sys.executable, "-c", WITHOUT_JAX + code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -167,33 +167,27 @@ def test_poses_for_pictures_are_those_of_the_kinematics(hand):
 # --- the page -------------------------------------------------------------------------------------------
 
 
-def wait_until(condition, seconds=25.0):
-    end = time.monotonic() + seconds
-    while not (met := condition()) and time.monotonic() < end:
-        time.sleep(0.02)
-    return met
-
-
-def test_the_page_runs_pauses_steps_and_begins_anew():
+def test_the_page_runs_pauses_steps_and_begins_anew(monkeypatch):
+    """In its own time: the loop asks before each frame whether it is to stop."""
     pytest.importorskip("viser")
-    source = open_source(ViewArguments(what=str(asset_path("episodes") / "grasp.npz")))
-    viewer, stop, shown = Viewer(source, title="test", port=18081), threading.Event(), []
+    source, now = open_source(ViewArguments(what=str(asset_path("episodes") / "grasp.npz"))), [5.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda seconds: now.append(now.pop() + seconds))
+    monkeypatch.setattr("dexsim.view.viewer.time", clock)
+    viewer, shown = Viewer(source, title="test", port=0), []
     viewer.scene.show = lambda frame, _: shown.append(round(float(frame.snapshot.seconds) / source.period))
-    tick = lambda: shown[-1] if shown else 0  # noqa: E731
-    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
-    running.start()
-    try:
-        assert wait_until(lambda: tick() > 5), "in real time"
+
+    def visitor():
+        yield from range(6)
+        assert shown == list(range(1, 7)) and now[0] - 5.0 == pytest.approx(6 * source.period), "in real time"
         viewer.paused.value = True
-        time.sleep(0.2)
-        at = tick()
-        time.sleep(0.2)
-        assert tick() == at
+        yield from range(2)
         viewer._step.value = True
-        assert wait_until(lambda: tick() == at + 1)
+        yield
+        assert shown[6:] == [6, 6, 7]
         viewer._reset.value = True
-        assert wait_until(lambda: tick() == 0)
-    finally:
-        stop.set()
-        running.join(10)
-    assert not running.is_alive()
+        yield
+        assert shown[-1] == 0
+
+    visit = visitor()
+    viewer.run(lambda: next(visit, "gone") == "gone")
+    assert len(shown) == 10

@@ -11,7 +11,7 @@ from test_safety import AGREEING, CYCLE, MIDDLE
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
-from dexsim_real.loop import GRACE, LoopThread, Pace, keep_phase
+from dexsim_real.loop import GRACE, LoopThread, Pace
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
@@ -198,18 +198,6 @@ def test_who_keeps_the_log_is_told_when_a_zero_has_moved(loop):
 # --- deadlines: kept, skipped, and in phase with the policy's --------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("rate", "policy", "expected"),
-    [(83.0, 100 / 3, 250 / 3), (83.0, 25.0, 83.0), (99.5, 25.0, 100.0), (40.0, 1000.0, 40.0), (12.4, 25.0, 12.5)],
-)
-def test_exchanges_keep_their_phase_with_the_policy(rate, policy, expected):
-    kept = keep_phase(rate, policy)
-    assert kept == pytest.approx(expected)
-    if kept != rate:  # At the policy's deadlines an exchange is in one of at most two phases.
-        phases = np.arange(40) / policy * kept % 1
-        assert len({round(float(phase), 3) % 1 for phase in phases}) <= 2
-
-
 @given(st.lists(st.one_of(st.floats(0.0, 0.05), st.floats(0.0119, 0.0132)), min_size=1, max_size=60))
 def test_a_cycle_begins_at_a_deadline_or_a_little_after_and_skips_what_is_past(durations):
     clock = [0.0]
@@ -232,11 +220,3 @@ def test_a_cycle_begins_at_a_deadline_or_a_little_after_and_skips_what_is_past(d
         missed, last = missed + index - last - 1, index
         assert pace.jitter.missed == missed and pace.jitter.worst <= GRACE + 1e-9
     assert pace.jitter.count == len(durations)
-
-
-def test_the_policy_begins_while_the_line_is_busy(hand):
-    loop = LoopThread(None, HandSensing(hand, HardwareConfig()), None, 250 / 3)
-    for now in np.linspace(0, 0.2, 41) + loop.pace.next - 0.05:
-        begin = loop.free(now)
-        assert now <= begin < now + loop.pace.period + 1e-9
-        assert (begin - loop.pace.next) % loop.pace.period == pytest.approx(0.001, abs=1e-6)

@@ -51,13 +51,12 @@ def moving(folder, *without):
 def test_signals_in_a_row_turn_the_motors_off(tmp_path, number):
     """The second and later ones come while the first is handled, whose exit code it is."""
     with moving(tmp_path) as (peer, process):
-        sent = time.monotonic()
         for each in (number, signal.SIGTERM, signal.SIGTERM):
             process.send_signal(each)
             time.sleep(random.uniform(0.001, 0.006))
-        assert process.wait(20) == 128 + number
-        on = peer.on()
-        assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
+        assert process.wait(60) == 128 + number
+        on = peer.on().astype(int)
+        assert not on[-1] and np.sum(np.diff(on) > 0) == 1, "off once and for all"
     report = summary(tmp_path)
     assert report["motors_off"]
     assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in report["end"]
@@ -92,7 +91,7 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
         assert process.poll() is None
         peer.open()
         asked = len(peer.commands)
-        assert process.wait(20) == 130
+        assert process.wait(60) == 130
         assert len(peer.commands) > asked and not peer.on()[asked:].any()
     assert summary(tmp_path)["motors_off"]
 
@@ -105,7 +104,7 @@ def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
         assert process.wait(30) == 1
         asked = len(peer.commands)
         peer.open()
-        wait(lambda: len(peer.commands) > asked, 20.0)
+        wait(lambda: len(peer.commands) > asked)
         assert not peer.on()[asked:].any()
     report = summary(tmp_path)
     assert not report["motors_off"] and "press the emergency stop" in report["end"]
@@ -115,8 +114,8 @@ def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
 def test_the_guard_stops_the_hand_of_a_runner_that_was_killed_or_suspended(tmp_path, way):
     with moving(tmp_path, "--no-guard") as (peer, process):
         process.send_signal(way)
-        process.wait(20)
-        wait(lambda: not peer.on()[-1], 10.0)
+        process.wait(60)
+        wait(lambda: not peer.on()[-1])
 
 
 def test_the_guard_waits_for_a_cable():
@@ -130,9 +129,9 @@ def test_the_guard_waits_for_a_cable():
         guard.dismiss(off=False)
         time.sleep(1.0)
         peer.open()
-        wait(lambda: len(peer.commands) > 0, 5.0)
+        wait(lambda: len(peer.commands) > 0)
         assert not peer.on().any()
-        assert guard._process.wait(10) == 0
+        assert guard._process.wait(60) == 0
 
 
 def test_the_guard_leaves_a_hand_alone_whose_motors_were_never_on():
@@ -242,5 +241,5 @@ def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(t
     armed = Guard("sdk:loud_sdk", QUICK, load_hand())
     armed.arm()
     armed.dismiss(off=False)
-    assert armed._process.wait(10) == 0
+    assert armed._process.wait(60) == 0
     assert set(heard.read_text().split()) == {"False"}

@@ -32,13 +32,12 @@ def test_an_object_that_is_let_go_over_the_hand_is_felt():
     assert bench.safety.sample.measured.finger_force.max() > 1.0 and not bench.safety.latched
 
 
-@pytest.mark.usefixtures("jax_as_it_is")
+@pytest.mark.usefixtures("jax_as_it_is", "virtual_time")
 @pytest.mark.parametrize("name", ["leap_like", pytest.param("inspire_like", marks=pytest.mark.slow)])
 def test_a_policy_runs_and_its_log_is_replayed_to_the_last_bit(name, tmp_path, capsys):
     policy, log = tmp_path / "policy.msgpack", tmp_path / "run.log"
     untrained(load_hand(name), policy)
     options = "--uncalibrated --fixed-object --yes --seconds 1.5 --approach 0.5 --quiet --no-realtime --no-guard"
-    options += " --safety.stale 1 --safety.watchdog 2"  # This machine may be busy.
     files = ["--log", str(log), "--output", str(tmp_path / "run.json")]
     run.main([str(policy), "--port", MOCK, *options.split(), *files])
     summary = json.loads((tmp_path / "run.json").read_text())

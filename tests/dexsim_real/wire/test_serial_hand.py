@@ -4,12 +4,12 @@ import dataclasses
 import errno
 import re
 import termios
-import time
 
 import numpy as np
 import pytest
 from emulated_plant import motors
-from pty_hand import QUICK, Clock, PtyHand, connect_in_memory
+from pty_hand import QUICK, PtyHand, connect_in_memory
+from virtual_time import VirtualTime
 
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
@@ -28,7 +28,7 @@ serial = pytest.importorskip("serial")
 
 def memory_port(monkeypatch, peer, config=QUICK):
     """A port to this hand over a line in memory, and the clock of both."""
-    clock = Clock()
+    clock = VirtualTime()
     connect_in_memory(monkeypatch, peer, clock)
     port = SerialHand("loop://", config)
     port._open()
@@ -176,7 +176,7 @@ def test_answers_that_come_too_soon_or_too_late_are_told(monkeypatch):
     for version, delay in ((b"1", 0.0), (None, 0.113), (None, 0.15)):
         peer = PtyHand(version=version)
         peer.delay = delay
-        connect_in_memory(monkeypatch, peer, Clock())
+        connect_in_memory(monkeypatch, peer, VirtualTime())
         with pytest.raises(HandError, match="too late; raise --link.margin.*--link.no-paced"):
             SerialHand("loop://", dataclasses.replace(QUICK, paced=True, margin=0.1, handshake=0.6)).connect()
 
@@ -270,13 +270,13 @@ def test_another_hand_is_refused_in_one_line_and_what_is_unknown_is_told(hand):
     ("back", "says"),
     [(b"2R32A001", ""), (b"2R32B002", "2R32B002, not right, serial number 2R32A001"), (None, "unknown")],
 )
-def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
+def test_after_a_reconnection_only_the_same_hand_is_driven(hand, virtual_time, back, says):
     """Cable out while the motors are on; what comes back may be another hand, or not tell. Both end the run."""
     peer = PtyHand(registers={20: b"right", 21: b"2R32A001"})
     peer.state["joint"]["position"] = np.array([0.1] * 3 + [0.0] + [0.1] * 8)
     peer.open()
     port, safety = SerialHand(peer.port, QUICK), Safety(hand, SafetyConfig())
-    loop = LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 83.0)
+    loop = LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 83.0, clock=virtual_time.monotonic)
     port.connect()
     for _ in range(10):  # A pose needs as many.
         loop.cycle()
@@ -288,12 +288,13 @@ def test_after_a_reconnection_only_the_same_hand_is_driven(hand, back, says):
     peer.commands.clear()
     peer.registers = {20: b"right", 21: back} if back else {}
     peer.open()
-    until = time.monotonic() + 20
-    while time.monotonic() < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
+    until = virtual_time.now + 20
+    while virtual_time.now < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
         loop.cycle()
     driven = any(np.any(command["mode"] != Mode.PASSIVE) for command in peer.commands)
     # The first answer of the new generation is from a passive hand: its pose may have changed.
-    assert not driven or not np.any(peer.commands[0]["mode"]) and loop.cycle().generation > 1
+    first = [command["mode"] for command in peer.commands[:2]]  # of the connection, and of the exchange after it
+    assert not driven or not np.any(first) and loop.cycle().generation > 1
     assert not driven or port.counts.lost == port.counts.reconnects == 1
     port.close()
     peer.close()

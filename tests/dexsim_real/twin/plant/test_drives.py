@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from emulated_plant import drives, motors
 
+from dexsim_real.twin.plant import drives as constants
 from dexsim_real.twin.plant.drives import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS
 from dexsim_real.wire.frames import Mode
 
@@ -79,3 +80,16 @@ def test_commands_reach_each_board_after_its_own_delay(hand):
         new = np.isnan(reached) & (torque > 0.1)
         reached[new] = k * PERIOD
     assert reached == pytest.approx(0.005 + np.ceil(made.delay / PERIOD - 1e-6) * PERIOD, abs=1e-9)
+
+
+def test_heat_settles_where_loss_and_flow_balance(hand, monkeypatch):
+    monkeypatch.setattr(constants, "WINDING", 0.01)
+    monkeypatch.setattr(constants, "CASE", 0.02)
+    made = drives(hand, thermal=1.0)
+    made.send(0.0, motors(0.1 * hand.torque_limit))
+    for k in range(4000):
+        torque, _ = made.step(k * PERIOD, np.zeros(12), np.zeros(12))
+    loss = 0.3**2 * 6.0 * (1 + 0.0039 * (made.winding - 25.0))  # 3 Nm/rad: 0.3 of 1 A; copper
+    assert made.winding - made.case == pytest.approx(8.0 * loss, rel=1e-3)
+    assert made.case == pytest.approx(26.0 + 14.0 * loss, rel=1e-3)
+    assert torque == pytest.approx(0.3 * hand.torque_limit * (1 - 0.001 * (made.winding - 25.0)), rel=1e-3)
