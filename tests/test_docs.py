@@ -147,11 +147,12 @@ def test_shipped_numbers_are_those_of_their_records():
 
 
 def test_the_readme_has_the_numbers_of_the_shipped_policies():
-    """Revolutions are a quarter of the quarter turns, shares and correlations are rounded."""
+    """And their intervals. Revolutions are a quarter of the quarter turns, shares and correlations are rounded."""
     readme, means = (ROOT / "README.md").read_text(), {}
     for section in re.split(r"^## ", SHIPPED_PAGE, flags=re.M):
-        for policy, mean in re.findall(r"^\| `(\w+)` \| [^|]+ \| [^|]+ \| [^|]+ \| ([\d.]+) ", section, re.M):
-            means.setdefault((section.partition("\n")[0], policy), []).append(float(mean))
+        row = r"^\| `(\w+)` \| [^|]+ \| [^|]+ \| [^|]+ \| ([\d.]+) \| ([\d.]+)–([\d.]+) "
+        for policy, *mean in re.findall(row, section, re.M):
+            means.setdefault((section.partition("\n")[0], policy), []).extend(map(float, mean))
     table = re.findall(r"^\| `(\w+)`[^|]*\|([^|]+)\|([^|]+)\|", readme, re.M)
     assert [policy for policy, *_ in table] == list(SHIPPED)
     for policy, *cells in table:
@@ -160,6 +161,6 @@ def test_the_readme_has_the_numbers_of_the_shipped_policies():
                 round(mean / part, digits) for mean in means[world, policy] for part in (1, 4) for digits in (0, 2)
             }
             assert numbers(cell) <= known, (policy, world)
-    touch = [mean for (section, _), found in means.items() if section == "Touch taken away" for mean in found]
+    touch = [mean for (section, _), found in means.items() if section == "Touch taken away" for mean in found[::3]]
     words = readme.replace(",", "").replace(".\n", " ").split()
     assert len(touch) == 4 and {f"{mean / 4:.{int(mean < 4)}f}" for mean in touch} <= set(words)

@@ -78,7 +78,8 @@ def parse(
 
 
 def announce_loading() -> None:
-    """Say on standard error what a command's imports will take seconds over; nothing above a help page."""
+    """Say that imports take seconds; nothing above a help page. Off GPUs silence XLA's banner on slow compilation."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "1" if Path("/dev/nvidiactl").exists() else "3")
     if not wants_help(sys.argv):
         print("loading JAX and MuJoCo", file=sys.stderr, flush=True)
 

@@ -4,8 +4,6 @@ Drawn with Pillow and NumPy: matplotlib would cost more than the rest of a frame
 seen from outside: column 0 at the left, row 0 (base of the fingertip) at the bottom; taxel index = column * rows + row.
 """
 
-from functools import lru_cache
-
 import numpy as np
 
 from dexsim.hand.description import Hand
@@ -37,13 +35,6 @@ def force_color(force: np.ndarray, force_range: float) -> np.ndarray:
     return _COLORS[np.clip(level * (len(_COLORS) - 1), 0, len(_COLORS) - 1).astype(int)]
 
 
-@lru_cache(maxsize=8)
-def _font(size: int):
-    from PIL import ImageFont
-
-    return ImageFont.load_default(size)
-
-
 def draw_panel(
     hand: Hand, size: tuple[int, int], snapshot: Snapshot, force_range: float, finger_range: float, live: bool = False
 ) -> np.ndarray:
@@ -52,7 +43,7 @@ def draw_panel(
 
     The bar under a map is the finger's force out of `finger_range` N; its mark is the target.
     """
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
     captions, lines = (FELT, {}) if live else (TRUE, read_outs(snapshot))
     (columns, rows), count = hand.taxel_grid, (hand.num_fingers + 2) // 2
@@ -64,7 +55,7 @@ def draw_panel(
     left, top = (size[0] - 2 * step[0]) // 3, (size[1] - count * step[1]) // (count + 1)
     slots = [(left + k % 2 * (step[0] + left), top + k // 2 * (step[1] + top)) for k in range(hand.num_fingers + 1)]
     image = Image.new("RGB", size, PANEL)
-    draw, font, target = ImageDraw.Draw(image), _font(font_size), float(snapshot.target_force)
+    draw, font, target = ImageDraw.Draw(image), ImageFont.load_default(font_size), float(snapshot.target_force)
     force = np.asarray(snapshot.taxel_force)
     colors = np.where(force[..., None] > 0, force_color(force, force_range), np.array(EMPTY, np.uint8))
     gap = np.arange(cell) >= cell - _GAP
@@ -86,14 +77,14 @@ def draw_panel(
             draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
     # The colour scale, and above it the read-outs; a small panel has little room.
     x, y = slots[-1]
-    small, thick = _font(font_size - 2), max(4, cell)
+    small, thick = ImageFont.load_default(font_size - 2), max(4, cell)
     bar = y + height - thick
     scale = force_color(np.linspace(0, force_range, width)[None].repeat(thick, 0), force_range)
     image.paste(Image.fromarray(scale), (x, bar))
     draw.text((x, bar + thick + 3), "0", fill=FAINT, font=small)
     draw.text((x + width, bar + thick + 3), f"{force_range:.2g} N / taxel", fill=FAINT, font=small, anchor="ra")
     pitch = min(round(1.35 * font_size), (height - thick) // max(len(captions) + len(lines), 1))
-    small = _font(min(font_size - 2, pitch))
+    small = ImageFont.load_default(min(font_size - 2, pitch))
     for caption in captions:
         draw.text((x, y), caption, fill=FAINT, font=small)
         y += pitch
@@ -106,12 +97,12 @@ def draw_panel(
 
 
 def read_outs(snapshot: Snapshot) -> dict[str, str]:
-    """What a picture says in words, by name: time, turns or command and target, and the fingers' force in all."""
+    """What a picture says in words, by name: time, quarter turns or command and target, total force."""
     lines = {}
     if snapshot.seconds is not None:
         lines["time"] = f"{float(snapshot.seconds):.1f} s"
     if snapshot.turns is not None:
-        lines["turns"] = f"{int(snapshot.turns)}"
+        lines["quarter turns"] = f"{int(snapshot.turns)}"
     elif np.size(snapshot.command):
         lines["command"] = " ".join(f"{c:.2f}" for c in np.ravel(snapshot.command)[:3])
         if np.isfinite(snapshot.target_force):

@@ -1,14 +1,14 @@
 """The picture of a posed hand, its taxels and the object, by MuJoCo's ray caster: no OpenGL, no display, and the same
 picture on every machine."""
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from dexsim.hand.description import Hand, unit
+from dexsim.hand.description import Geom, Hand, unit
 from dexsim.hand.mjcf import Pose, quaternion
 from dexsim.render.panel import force_color
 
@@ -35,12 +35,17 @@ _TAXEL_LIFT = 0.001  # m; the pads follow the taxel lattice to within 1 mm, and 
 _TAXEL_RADIUS = 0.0007  # m; twice that under full load, up to touching its neighbours
 _OBJECT_OPACITY = 0.62  # so that fingers behind the object stay visible
 _TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
+_ROUNDED = 0.7  # radius of a box's edges over its least half size
 _GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m to the right and up of the middle
 
 # Linear RGB.
 _IDLE_TAXEL = (0.08, 0.09, 0.1)
 _SKY, _GROUND, _KEY = np.array([[0.46, 0.51, 0.58], [0.18, 0.16, 0.15], [1.5, 1.44, 1.33]])
-_BACKDROP = np.array([[0.040, 0.047, 0.060], [0.012, 0.014, 0.019]])  # middle, corners
+_BACKDROP = (0.034, 0.040, 0.051)
+_TILES = np.array([[0.052, 0.058, 0.068], [0.066, 0.073, 0.084]])  # of the floor, 5 cm wide
+FIELD_OF_VIEW = 30.0  # deg, vertical
+FLOOR = 0.13  # m below the point that the camera looks at
+_HORIZON, _SHADE = 1.2, 0.75  # m, at which the floor has faded to 1/e; depth of the shadow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +62,6 @@ class Camera:
     """The point in the middle of the picture [m], palm frame."""
     up: tuple[float, float, float] = (-1.0, 0.0, 0.0)
     """Against gravity. (-1, 0, 0) is a hand held palm down, (1, 0, 0) palm up."""
-    field_of_view: float = 30.0
-    """Vertical opening angle [deg]."""
 
 
 class CameraView(NamedTuple):
@@ -97,15 +100,9 @@ def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> CameraV
     upward = np.cos(elevation) * up - np.sin(elevation) * level
     axes = np.stack([np.cross(upward, back), upward, back])
     width, height = size[0] * supersample, size[1] * supersample
-    scale = height / 2 / np.tan(np.deg2rad(camera.field_of_view) / 2)
+    scale = height / 2 / np.tan(np.deg2rad(FIELD_OF_VIEW) / 2)
     origin = np.asarray(camera.target, np.float64) + camera.distance * back
     return CameraView(origin, axes, float(scale), (width, height))
-
-
-def linear(color: Color) -> tuple[float, float, float]:
-    """A colour as linear light in [0, 1]."""
-    red, green, blue = (np.asarray(color) / 255) ** 2.2
-    return float(red), float(green), float(blue)
 
 
 class Primitives(NamedTuple):
@@ -116,14 +113,6 @@ class Primitives(NamedTuple):
     position: np.ndarray  # [G, 3], m
     rotation: np.ndarray  # [G, 3, 3]
     color: np.ndarray  # [G, 6, 3], linear RGB of what faces +x, -x, +y, -y, +z, -z
-
-
-class Surface(NamedTuple):
-    """What each ray of a view sees first. Depth runs along the optical axis."""
-
-    depth: np.ndarray  # [H, W] m, 1e6 where empty
-    primitive: np.ndarray  # [H, W] int, -1 where empty
-    normal: np.ndarray  # [H, W, 3] unit, outward
 
 
 def draw_scene(
@@ -138,25 +127,27 @@ def draw_scene(
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
     canvas = Canvas(camera, size)
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
+    canvas.paint_floor(np.concatenate([body.position, held.position]))
     links, front = canvas.cast(body), canvas.cast(held)
-    canvas.paint(body, links, links.primitive >= 0)
-    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth)
-    canvas.paint(held, front, front.depth < links.depth, _OBJECT_OPACITY)
+    depth = links[0]
+    canvas.paint(body, links, depth < _FAR)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, depth)
+    canvas.paint(held, front, front[0] < depth, _OBJECT_OPACITY)
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
-    canvas.paint_taxels(pose, frame.taxel_force, force_range, links.depth, _TAXEL_GLOW)
+    canvas.paint_taxels(pose, frame.taxel_force, force_range, depth, _TAXEL_GLOW)
     if frame.goal_rotation is not None:
         # The object again, smaller and in its goal orientation.
         turn = frame.goal_rotation @ frame.object_rotation.T
         position = goal_position(camera) + _GOAL_SCALE * (held.position - frame.object_position) @ turn.T
         goal = held._replace(size=_GOAL_SCALE * held.size, position=position, rotation=turn @ held.rotation)
         marker = canvas.cast(goal)
-        canvas.paint(goal, marker, marker.depth < np.minimum(links.depth, front.depth), _GOAL_OPACITY)
+        canvas.paint(goal, marker, marker[0] < np.minimum(depth, front[0]), _GOAL_OPACITY)
     return canvas.develop()
 
 
 def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
     """The hand's geoms, posed; the palm, the links and the fingertips in three tones."""
-    geoms = [geom for geom in hand.geoms if geom.kind != "plane"]
+    geoms = list(drawn_geoms(hand))
     body = np.array([geom.body for geom in geoms])
     turn = pose.body_rotation[body]
     position = np.einsum("gij,gj->gi", turn, [geom.position for geom in geoms])
@@ -166,8 +157,25 @@ def hand_primitives(hand: Hand, pose: Pose) -> Primitives:
         np.array([geom.size for geom in geoms]),
         pose.body_position[body] + position,
         turn @ np.array([geom.rotation for geom in geoms]),
-        np.array([[linear(tone)] * 6 for tone in tones]),
+        (np.array([[tone] * 6 for tone in tones]) / 255) ** 2.2,
     )
+
+
+def drawn_geoms(hand: Hand) -> Iterator[Geom]:
+    """The hand's geoms as pictures show them: a box rounded, as three boxes and a capsule along each edge."""
+    for geom in hand.geoms:
+        if geom.kind == "box":
+            radius = _ROUNDED * min(geom.size)
+            inner = np.asarray(geom.size) - radius
+            for axis in range(3):
+                turn = geom.rotation @ np.roll(np.eye(3), axis + 1, 0)  # its z is the box's axis
+                yield replace(geom, size=inner + radius * (np.arange(3) == axis))
+                for signs in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+                    place = geom.position + geom.rotation @ (inner * np.insert(signs, axis, 0))
+                    size = np.array([radius, inner[axis], 0])
+                    yield replace(geom, kind="capsule", size=size, position=place, rotation=turn)
+        elif geom.kind != "plane":
+            yield geom
 
 
 def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
@@ -180,7 +188,7 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
         frame.primitive_size[active],
         frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T,
         frame.object_rotation @ frame.primitive_rotation[active],
-        np.tile([linear(tone) for tone in tones], (len(active), 1, 1)),
+        np.tile((np.array(tones) / 255) ** 2.2, (len(active), 1, 1)),
     )
 
 
@@ -194,13 +202,15 @@ class Canvas:
 
     def __init__(self, camera: Camera, size: tuple[int, int]):
         self.view = look(camera, size, _SUPERSAMPLE)
-        self.rays, self._color = self.view.rays(), _backdrop(self.view.size).copy()
-        self._up = unit(np.asarray(camera.up, float))
+        self.rays = self.view.rays()
+        self._color = np.full_like(self.rays, _BACKDROP)
+        self._up, self._target = unit(np.asarray(camera.up, float)), np.asarray(camera.target)
         axes = self.view.axes
         self._light = unit(0.55 * axes[0] + 0.75 * self._up + 0.75 * axes[2])  # over the camera's right shoulder
 
-    def cast(self, primitives: Primitives) -> Surface:
-        """What of these each ray sees first."""
+    def cast(self, primitives: Primitives) -> tuple[np.ndarray, ...]:
+        """What of these each ray sees first: its depth [H, W] m along the optical axis, 1e6 where there is none, index,
+        and outward normal [H, W, 3]."""
         spec, rays = mujoco.MjSpec(), self.rays
         for kind, size, position, rotation in zip(*primitives[:4], strict=True):
             shape, quat = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), quaternion(rotation)
@@ -213,13 +223,28 @@ class Canvas:
         origin = self.view.origin
         mujoco.mj_multiRay(model, data, origin, rays.ravel(), None, True, -1, index, distance, normal, count, _FAR)
         index, depth = index.reshape(rays.shape[:2]), distance.reshape(rays.shape[:2])
-        return Surface(np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape))
+        return np.where(index < 0, _FAR, depth), index, normal.reshape(rays.shape)
 
-    def paint(self, primitives: Primitives, surface: Surface, visible: np.ndarray, opacity: float = 1.0) -> None:
-        """Shade what is `visible` [H, W] of a surface by sky, ground and one warm key light, and lay it over the
-        picture."""
-        index, normal = surface.primitive[visible], surface.normal[visible]
-        away = (1 - np.clip(-np.sum(normal * unit(self.rays[visible]), -1), 0, 1))[:, None]
+    def paint_floor(self, above: np.ndarray) -> None:
+        """A chequered floor, and on it one soft shadow of what is at the points `above` [P, 3]."""
+        down, eye = -self._up, self._target - self.view.origin
+        height = FLOOR + eye @ down  # of the camera
+        slope = self.rays @ down
+        below = height * slope > 0
+        level = np.stack([self.view.axes[0], np.cross(self.view.axes[0], down)], -1)
+        place = (self.rays[below] * (height / slope[below])[:, None] - eye) @ level  # [M, 2] m from below the target
+        tile = _TILES[np.floor(place / 0.05).astype(int).sum(-1) % 2]
+        points = (above - self._target) @ level
+        away = place - points.mean(0)
+        spread = np.linalg.inv(np.cov(points.T) + 0.02**2 * np.eye(2))
+        tile = tile * (1 - _SHADE * np.exp(-0.5 * np.sum(away @ spread * away, -1)))[:, None]
+        share = np.exp(-np.sum((place / _HORIZON) ** 2, -1))[:, None]
+        self._color[below] += share * (tile - self._color[below])
+
+    def paint(self, primitives: Primitives, hits: tuple[np.ndarray, ...], mask: np.ndarray, opacity: float = 1) -> None:
+        """Shade what `mask` [H, W] names of a cast by sky, ground and one warm key light, over the picture."""
+        _, index, normal = (part[mask] for part in hits)
+        away = (1 - np.clip(-np.sum(normal * unit(self.rays[mask]), -1), 0, 1))[:, None]
         shade = _GROUND + (0.5 + 0.5 * normal @ self._up)[:, None] * (_SKY - _GROUND)
         shade += np.maximum(normal @ self._light, 0)[:, None] * _KEY
         local = np.einsum("mk,mkl->ml", normal, primitives.rotation[index])
@@ -227,7 +252,7 @@ class Canvas:
         shade *= primitives.color[index, 2 * axis + (local[np.arange(len(axis)), axis] < 0)]
         shade += 0.1 * away**3  # a rim of light
         # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
-        self._color[visible] += (opacity + (1 - opacity) * away**2) * (shade - self._color[visible])
+        self._color[mask] += (opacity + (1 - opacity) * away**2) * (shade - self._color[mask])
 
     def paint_taxels(
         self, pose: Pose, force: np.ndarray, force_range: float, depth: np.ndarray, glow: float | None = None
@@ -259,12 +284,3 @@ class Canvas:
         n = _SUPERSAMPLE
         light = self._color.reshape(height // n, n, width // n, n, 3).mean((1, 3))
         return (255 * np.clip(light, 0, 1) ** (1 / 2.2)).round().astype(np.uint8)
-
-
-@lru_cache(maxsize=4)
-def _backdrop(size: tuple[int, int]) -> np.ndarray:
-    """A soft vignette, linear RGB [H, W, 3]."""
-    width, height = size
-    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    edge = np.clip((x**2 + y**2) / 1.6, 0, 1)[..., None]
-    return _BACKDROP[0] + (_BACKDROP[1] - _BACKDROP[0]) * edge

@@ -1,7 +1,4 @@
-"""Frames, videos and taxel maps: the hand, the object and what 600 taxels feel, drawn without OpenGL.
-
-Pillow and matplotlib are imported when first used.
-"""
+"""Frames, videos and taxel maps: the hand, the object and what 600 taxels feel, drawn without OpenGL."""
 
 import dataclasses
 import io
@@ -22,7 +19,7 @@ from dexsim.render.picture import Camera, draw_scene
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {
-    "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.43, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
+    "grasp": Camera(azimuth=100.0, elevation=8.0, distance=0.43, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
     "rotate": Camera(azimuth=95.0, elevation=30.0, distance=0.50, target=(0.045, 0.010, 0.085), up=(1.0, 0.0, 0.0)),
 }
 """The hand held palm down, and palm up from the side on which fingers and thumb are both in sight."""

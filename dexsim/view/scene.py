@@ -12,7 +12,7 @@ import trimesh
 from dexsim.hand.description import Hand, primitive_mesh
 from dexsim.hand.mjcf import Pose, hand_poses, quaternion
 from dexsim.render.panel import force_color
-from dexsim.render.picture import FACES, LINK, OBJECT, PALM, TIP, Color, look
+from dexsim.render.picture import FACES, FIELD_OF_VIEW, FLOOR, LINK, OBJECT, PALM, TIP, Color, drawn_geoms, look
 from dexsim.render.render import camera_of
 from dexsim.render.snapshot import Snapshot
 
@@ -23,8 +23,6 @@ _GOAL_AT = 0.10  # m above the object, where the goal is shown
 _GOAL_SCALE = 0.6  # of the object, at which the goal is shown
 _AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
 _LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
-_ABOVE = 8.0  # deg, lowest elevation of the camera at first
-_FLOOR = 0.2  # m below the point that the camera looks at
 
 
 class Frame(NamedTuple):
@@ -52,21 +50,19 @@ class Scene:
         server.scene.add_light_ambient("/light", intensity=1.2)
         size = {"width": 1.2, "height": 1.2, "cell_size": 0.05, "section_size": 0.2}
         tones = {"cell_color": (52, 56, 64), "section_color": (78, 84, 94)}
-        place = tuple(np.asarray(view.target) - _FLOOR * self._up)
+        place = tuple(np.asarray(view.target) - FLOOR * self._up)
         server.scene.add_grid("/floor", plane="yz", position=place, **size, **tones)  # Every preset's up is along x.
-        # Above the floor, farther away than a film's camera, and aside: the controls cover a part of the page.
-        above = max(view.elevation, _ABOVE)
-        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance, elevation=above), (4, 3))
+        # Farther away than a film's camera, and aside: the controls cover a part of the page.
+        eye = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
         aside = _ASIDE * eye.axes[0]
         server.initial_camera.position = tuple(eye.origin + aside)
         server.initial_camera.look_at = tuple(view.target + aside)
-        server.initial_camera.fov = float(np.deg2rad(view.field_of_view))
+        server.initial_camera.fov = float(np.deg2rad(FIELD_OF_VIEW))
         self._links = [server.scene.add_frame(f"/hand/{name}", show_axes=False) for name in hand.body_names]
-        for number, geom in enumerate(hand.geoms):
-            if geom.kind != "plane":
-                tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
-                name, mesh = f"/hand/{hand.body_names[geom.body]}/{number}", primitive_mesh(geom.kind, geom.size)
-                self._add_mesh(name, mesh, tone, geom.position, geom.rotation)
+        for number, geom in enumerate(drawn_geoms(hand)):
+            tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
+            name, mesh = f"/hand/{hand.body_names[geom.body]}/{number}", primitive_mesh(geom.kind, geom.size)
+            self._add_mesh(name, mesh, tone, geom.position, geom.rotation, flat_shading=geom.kind == "box")
         # Each fingertip carries its taxels, so that they are in place however late a slow browser draws.
         self._taxels = [
             server.scene.add_point_cloud(

@@ -25,7 +25,6 @@ from dexsim_ppo.policy import Policy, load_policy
 NONE = "none"
 """The choice of no policy: actions are zero."""
 _ANY = "any"
-_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
 _SHOWN = 1.0  # s that a dropped object stays in sight
 _NEWEST = 20  # files of runs that are listed
 
@@ -71,7 +70,7 @@ class Simulation:
         if hasattr(self._goal, "command"):
             self._command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5)
         self._friction = gui.add_slider("friction factor", min=0.1, max=2.0, step=0.05, initial_value=1.0)
-        self._speed = gui.add_slider("push [m/s]", min=0.0, max=2.0, step=0.1, initial_value=_PUSH)
+        self._speed = gui.add_slider("push [m/s]", min=0.0, max=2.0, step=0.1, initial_value=0.5)
         self._push = gui.add_button("push")
 
     def episode(self) -> Iterator[Frame]:

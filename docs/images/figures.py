@@ -128,7 +128,7 @@ def robustness() -> None:
         axis.axhspan(reference[2], reference[3], color="0.5", alpha=0.12, lw=0)
         axis.set_xlabel(row.label.partition(": ")[2], fontsize=8)
         axis.tick_params(labelsize=7)
-        axis.set_ylim(0, None)
+        axis.set_ylim(0, 1.05 * max(points[:, 3].max(), reference[3]))
     for axis in axes[:, 0]:
         axis.set_ylabel("quarter turns a minute", fontsize=8)
     axes[0, 0].legend(fontsize=6, frameon=False, loc="lower left")

@@ -30,24 +30,24 @@ def recorded():
 @pytest.mark.parametrize("kind", KINDS)
 def test_rays_hit_the_surface_with_outward_normals(kind):
     """Sizes, poses and the projection are MuJoCo's: by the distance functions that the taxels use."""
-    size, place = np.float32(SIZES[kind]), np.float32([0.01, -0.02, 0.03])
+    size, place = np.array([SIZES[kind]], float), np.array([[0.01, -0.02, 0.03]])
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     canvas = Canvas(Camera(azimuth=40, elevation=30, distance=0.3), (60, 60))
     view, rays, color = canvas.view, canvas.rays, np.full((1, 6, 3), 0.5, np.float32)
-    surface = canvas.cast(Primitives((kind,), size[None].astype(float), place[None].astype(float), turn[None], color))
-    seen = surface.primitive == 0
-    assert seen.sum() > 300 and np.all(surface.depth[~seen] == 1e6)
+    depth, _, normal = canvas.cast(Primitives((kind,), size, place, turn[None], color))
+    seen = depth < 1e6
+    assert seen.sum() > 300
     seen &= np.cumsum(seen).reshape(seen.shape) <= 300  # as many of every kind: one compilation
-    points = view.origin + surface.depth[seen][:, None] * rays[seen]
-    shape = sdf.Shape((kind,), size[None], place[None], np.float32(turn)[None], np.ones(1, bool))
+    points = view.origin + depth[seen][:, None] * rays[seen]
+    shape = sdf.Shape((kind,), *map(np.float32, (size, place, turn[None])), np.ones(1, bool))
     for away in (0.0, 1e-3):  # along the normal distance grows as fast as it can
-        distance = jax.jit(sdf.signed_distance)(np.float32(points + away * surface.normal[seen]), shape)
+        distance = jax.jit(sdf.signed_distance)(np.float32(points + away * normal[seen]), shape)
         np.testing.assert_allclose(distance, away, atol=2e-5)
-    assert np.all(np.sum(surface.normal[seen] * rays[seen], -1) < 1e-9)
+    assert np.all(np.sum(normal[seen] * rays[seen], -1) < 1e-9)
     rows, columns = np.nonzero(seen)
-    pixels, depth = view.project(points)
+    pixels, away = view.project(points)
     np.testing.assert_allclose(pixels, np.stack([columns, rows], -1) + 0.5, atol=1e-3)
-    np.testing.assert_allclose(depth, surface.depth[seen], rtol=1e-6)
+    np.testing.assert_allclose(away, depth[seen], rtol=1e-6)
 
 
 def test_a_loaded_taxel_shows_on_the_finger(hand, recorded):
