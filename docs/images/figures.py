@@ -114,7 +114,7 @@ def robustness() -> None:
     if not rows:
         print("robustness: no reports of the shipped rotation; python benchmarks/paper.py robustness makes them")
         return
-    figure, axes = figures._subplots(-(-len(rows) // 5), 5, 2.3, 2.1)
+    figure, axes = figures._subplots(5, 2.3, 2.1, -(-len(rows) // 5))
     for axis in axes.ravel()[len(rows) :]:
         axis.axis("off")
     reference = next(_points(reports["rotate_reference"]))
@@ -164,8 +164,7 @@ def skin() -> None:
         stress = touch.skin_force[1, foremost] / np.broadcast_to(hand.taxel_area, taxels.shape[:2])[1, foremost]
         measured.append((touch.depth[1, foremost] / law.thickness, stress))
     strain = np.linspace(0.0, law.max_compression, 36)
-    figure, axes = figures._subplots(1, 2, 4.2, 3.2)
-    left, right = axes[0]
+    figure, (left, right) = figures._subplots(2, 4.2, 3.2)
     left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, law)), color=figures.COLORS[0], label="Mooney–Rivlin")
     linear = dataclasses.replace(law, law="linear")
     left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, linear)), "--", color="0.5", label="linear")
