@@ -11,12 +11,12 @@ from paper.tables import Reports, mean_turns, seeds
 COLORS = ("#1f77b4", "#d95f02", "#2a9d5c", "#7b4fa3", "#8c6d31", "#555555", "#c0305e")
 
 
-def _subplots(columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """A figure that no window shows, and its axes [columns]."""
+def _subplots(columns: int, width: float, height: float, rows: int = 1) -> tuple[Any, Any]:
+    """A figure that no window shows, and its axes [rows, columns], or [columns] of one row."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * columns, height), layout="constrained")
-    return figure, figure.subplots(1, columns, squeeze=False)[0]
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)[0 if rows == 1 else slice(None)]
 
 
 def _save(figure: Any, path: Path) -> None:

@@ -1,8 +1,8 @@
 """Every picture of the documentation that the code makes: `make figures`.
 
 README's animation, films of the shipped policies, the live view, and the figures of the results. Figures of results are
-drawn from the reports in docs/results. Two kinds are kept as they were measured: learning curves, copied from the run
-that a policy is of, and contact points.
+drawn from the reports in docs/results. Learning curves are kept as they were measured, copied from the run that a
+policy is of.
 
 python docs/images/figures.py [NAME ...]
 """
@@ -114,7 +114,7 @@ def robustness() -> None:
     if not rows:
         print("robustness: no reports of the shipped rotation; python benchmarks/paper.py robustness makes them")
         return
-    figure, axes = figures._subplots(-(-len(rows) // 5), 5, 2.3, 2.1)
+    figure, axes = figures._subplots(5, 2.3, 2.1, -(-len(rows) // 5))
     for axis in axes.ravel()[len(rows) :]:
         axis.axis("off")
     reference = next(_points(reports["rotate_reference"]))
@@ -164,8 +164,7 @@ def skin() -> None:
         stress = touch.skin_force[1, foremost] / np.broadcast_to(hand.taxel_area, taxels.shape[:2])[1, foremost]
         measured.append((touch.depth[1, foremost] / law.thickness, stress))
     strain = np.linspace(0.0, law.max_compression, 36)
-    figure, axes = figures._subplots(1, 2, 4.2, 3.2)
-    left, right = axes[0]
+    figure, (left, right) = figures._subplots(2, 4.2, 3.2)
     left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, law)), color=figures.COLORS[0], label="Mooney–Rivlin")
     linear = dataclasses.replace(law, law="linear")
     left.plot(100 * strain, 1e-3 * np.asarray(skin_stress(strain, linear)), "--", color="0.5", label="linear")
@@ -215,6 +214,51 @@ def calibration() -> None:
         print(f"{name}: torque constant off by {constants[joint] / true - 1:+.1%}")
 
 
+def contacts() -> None:
+    """Contact centres on the taxel lattice and forces of the fingers while the shipped policy rotates, in simulation
+    (8 episodes of 30 s) and on the emulated hand (2 trials of 30 s)."""
+    from paper import figures
+
+    from dexsim_real.control.controller import Controller
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+    from dexsim_real.twin.virtual import VirtualRun
+
+    policy, hand, seconds, measured = load_policy("rotate"), dexsim.load_hand(), 30.0, list[np.ndarray]()
+    controller = Controller(policy, hand)
+    for trial in range(2):
+        run = VirtualRun(EmulatedHand(hand, "rotate", seconds=seconds, trials=1, first=trial), controller)
+        measured += [tick.readings.taxel_force for _, tick in run.ticking()]
+    settings = override(policy.env_config, ["pool_size=64", "trap=0"])
+    env = dataclasses.replace(policy, env_config=settings).make_env()
+    evaluation = dexsim.Evaluation(env)
+    state = evaluation.evaluation_starts(evaluation.evaluation_plan(8, 0))
+    step, carry, alive, simulated = jax.jit(jax.vmap(env.step)), policy.initial_carry(8), np.ones(8, bool), []
+    for _ in range(round(seconds / env.control_period)):
+        carry, action = policy.act(carry, state.obs["actor"])
+        state = step(state, action)
+        alive &= ~np.asarray(state.terminated)
+        simulated.append(np.asarray(state.readings.taxel_force)[alive])
+
+    figure, axes = figures._subplots(hand.num_fingers, 2.0, 2.4, 2)
+    worlds = {"simulation": np.concatenate(simulated), "emulated hand": np.array(measured)}
+    lattice = np.indices(hand.taxel_grid).reshape(2, -1).T  # column, row
+    for color, (name, taxels) in zip(figures.COLORS, worlds.items(), strict=False):
+        for finger, title in enumerate(hand.finger_names):
+            force = taxels[:, finger].sum(1)
+            touching, (above, below) = force > 0.5, axes[:, finger]
+            centre = taxels[touching, finger] @ lattice / force[touching, None]
+            above.plot(*centre.T, ".", ms=2, alpha=0.2, color=color, label=name, rasterized=True)
+            above.set(title=title, xlim=(-0.7, 9.7), ylim=(-0.7, 11.7), xlabel="column", aspect="equal")
+            share = np.full(touching.sum(), 1 / len(taxels))
+            below.hist(force[touching], np.arange(0.5, 16), weights=share, histtype="step", color=color, label=name)
+            below.set(xlabel="force on the taxels [N]", ylim=(0, 0.08))
+            print(f"{name}, {title}: touches {touching.mean():.1%}, {force[touching].mean():.1f} N")
+    axes[0, 0].set_ylabel("row (tip at the top)")
+    axes[1, 0].set_ylabel("share of the time")
+    axes[1, -1].legend(fontsize=7, frameon=False)
+    figures._save(figure, RESULTS / "figures" / "contacts.svg")
+
+
 def objects() -> None:
     """objects.jpg: each object that no training has seen, in the hand after 6 s of the middle command."""
     from paper.held_out import NAMES, HeldOutGrasp
@@ -250,7 +294,7 @@ def objects() -> None:
 
 MAKERS = {
     maker.__name__: maker
-    for maker in (tables, robustness, skin, calibration, objects, view, animation, films, episodes)
+    for maker in (tables, robustness, skin, calibration, contacts, objects, view, animation, films, episodes)
 }
 
 
