@@ -150,8 +150,8 @@ class DriverPort(HandPort):
         joint["current"] = 1e3 * current
         joint["temperature"] = np.clip(heat, 0, 255)
         errors = _checked("errors", state.errors, joints, state.errors is not None)
-        # Whatever does not fit must not read as no error.
-        joint["joint_error"] = np.where(errors == (errors.astype(int) & 0xFFFF), errors, 0xFFFF)
+        # Whatever does not fit must not read as no error; a driver's 8 bits cannot hold 0xFFFF (NumPy 2.5 raises).
+        joint["joint_error"] = np.where(errors == (errors.astype(int) & 0xFFFF), errors.astype(int), 0xFFFF)
         block["tip"]["taxel"]["z"] = force / NEWTONS_PER_COUNT
         return block
 
