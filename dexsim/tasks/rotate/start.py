@@ -242,7 +242,8 @@ def _at(
 
 def _scene(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> PhysicsScene:
     """The scene in C, with springs at the joints for the motors."""
-    scene = build_scene(hand, config.objects.slots, largest_size(config), config.physics, gravity, "mjx")
+    physics, margin = config.physics, config.skin.margin
+    scene = build_scene(hand, config.objects.slots, largest_size(config), physics, gravity, "mjx", margin)
     model, dofs = scene.model, scene.joint_dof
     model.jnt_stiffness[model.dof_jntid[dofs]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping

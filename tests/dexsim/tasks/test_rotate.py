@@ -491,3 +491,8 @@ def test_hand_computed():
     assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
     assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
     assert report["headline"]["fingertips at work (duty over 10 %)"] == 1
+
+
+def test_start_states_rest_on_the_rubber_of_the_skin(hand):
+    configs = RotateConfig(), RotateConfig(skin=dataclasses.replace(RotateConfig().skin, margin=0.001))
+    assert not np.array_equal(*(start._scene(hand, config, (9.81, 0.0, 0.0)).model.geom_size for config in configs))
