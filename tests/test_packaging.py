@@ -1,10 +1,8 @@
 """The distribution: names of each package's door, what importing loads, what the wheel holds."""
 
 import importlib
-import re
 import subprocess
 import sys
-import tomllib
 import zipfile
 from pathlib import Path
 
@@ -88,12 +86,3 @@ print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)), asset_
 """
     files = run("-P", "-c", code, cwd=elsewhere).split()
     assert len(files) == 4 and all(Path(name).is_relative_to(site) for name in files), files
-
-
-def test_the_distribution_has_the_name_that_messages_give():
-    from dexsim.core.install import DISTRIBUTION, install_line
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["name"] == DISTRIBUTION != "dexsim"
-    for extra in project["optional-dependencies"]:
-        assert re.fullmatch(rf"pip install -e '\.\[{extra}\]' .*\.whl\[{extra}\]'", install_line(extra))

@@ -120,8 +120,8 @@ class Safety:
         """Where commands continue [J] rad: the last one, or the measured pose with the motors off."""
         return self._rest() if self._commanded is None else self._commanded
 
-    def update(self, sample: HandSample) -> bool:
-        """Update with a measurement; returns whether it is plausible. Otherwise it does not count as one."""
+    def update(self, sample: HandSample) -> None:
+        """Update with a measurement. One that is not plausible does not count as one."""
         if self._generation not in (None, sample.generation):
             # The hand was disconnected with its motors off: its pose may have changed. A wrong reading remains wrong.
             self._commanded = self._confirmed = None
@@ -136,11 +136,10 @@ class Safety:
         if self.problem:
             self.counts["implausible: measurement"] += 1
             self._wrong.update(sample.time, True)
-            return False
+            return
         self.sample = sample
         self._wrong.update(sample.time, False)
         self.alarms.update(sample.time, measured, self._commanded)
-        return True
 
     def set_target(self, position: np.ndarray, time: float, hold_reason: str = "") -> None:
         """Request joint targets [J] rad at a time in s.

@@ -115,11 +115,8 @@ def rotation(name):
 
 @pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation", "rotate_clear"])
 def test_the_rotation_policies_turn(name):
-    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none.
-
-    The first two turn a cube on the palm, whose environments differ in what is observed and in latency: one serves.
-    """
-    env, step, starts = rotation(name if name == "rotate_clear" else "rotate_without_orientation")
+    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
+    env, step, starts = rotation(name)
     dropped, _, metrics = play(env, step, starts, 4.0, load_policy(name))
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns

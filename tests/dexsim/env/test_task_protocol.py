@@ -132,6 +132,7 @@ def test_taxels_feel_a_mesh_at_the_size_of_the_episode(monkeypatch):
     points = jnp.asarray(np.concatenate([sign * np.diag(1.2 * half + 0.001) for sign in (1, -1)]), jnp.float32)
     for method in ("grid", "surface_points"):
         geometry = touch_geometry(SimpleNamespace(mesh="cuboid.stl"), method)(SimpleNamespace(size=1.2 * half[None]))
+        assert isinstance(geometry, grid.Grid) == (method == "grid")
         np.testing.assert_allclose(jax.jit(signed_distance)(points, geometry), 0.001, atol=2e-4)
     primitives, shape = SimpleNamespace(mesh=""), solid("box", *half)
     assert touch_geometry(primitives, "closed_form") is ObjectParams.shape

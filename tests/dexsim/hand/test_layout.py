@@ -23,8 +23,7 @@ def test_neighbours_are_a_pitch_apart(kind):
     neighbours = np.sum(np.isclose(gap, 0.002), 1)
     assert neighbours.max() == (6 if kind == "hex" else 4)
     np.testing.assert_allclose(flat.mean(0), 0, atol=1e-12)
-    # A cell's area: the hexagon of that pitch, or the square.
-    np.testing.assert_allclose(taxels[:, 6], 0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
+    np.testing.assert_allclose(taxels[:, 6], 0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))  # hexagon or square
 
 
 @pytest.mark.parametrize("straight", [0.006, 0.0])

@@ -423,6 +423,23 @@ class TestPool:
         slide = np.where(tips, object.friction[:, None], object.link_friction[:, None])
         np.testing.assert_allclose(batch.expand("pair_friction")[rows][:, pairs, 0], slide[rows], rtol=1e-5)
 
+    def test_candidates_lie_on_the_palm_or_tipped_under_the_middle_finger(self, hand):
+        config = Rotate(RotateConfig(), hand).config
+        for key in jax.random.split(jax.random.key(2), 4):
+            object = sample_turned_object(key, config)
+            free, trap = (one(key, object, hand, config) for one in (start._candidate, start._trap_candidate))
+            low = lowest_point(object, free["qpos"][15:], free["qpos"][12:15])
+            assert float(low) == pytest.approx(palm_height(hand) + 0.001, abs=1e-5)
+            assert np.flatnonzero(trap["joint_target"] - trap["qpos"][:12] > 0.05).tolist() == [6, 7]
+
+    def test_at_rest_is_neither_moving_nor_turning_where_it_belongs(self, hand):
+        config = Rotate(RotateConfig(), hand).config
+        place, motion = np.tile([*config.reference, 1.0, 0.0, 0.0, 0.0], (5, 1)), np.zeros((5, 6))
+        motion[1, 0], motion[2, 4], place[3, 1], place[4, 3:] = 0.06, 1.1, place[3, 1] + 0.05, turned(25, (0, 1, 0))
+        assert start._stays(config, place, motion, False).tolist() == [True, False, False, False, False]
+        place[:, 2], place[:3, 3:] = place[:, 2] + 0.02, place[4, 3:]  # further toward the fingertips, tipped
+        assert start._stays(config, place, motion, True).tolist() == [True, False, False, False, True]
+
     def test_objects_that_fingers_hold_begin_clear_of_the_palm(self, hand):
         cube = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), draw_object(jax.random.key(0), RotateConfig()))
         qpos = np.zeros((3, 19), np.float32)

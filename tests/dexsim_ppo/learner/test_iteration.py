@@ -15,6 +15,7 @@ from dexsim_ppo.learner import distribution, running_stats, update
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.loss import Samples
+from dexsim_ppo.learner.networks import init_mlp
 from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, merge_moments
@@ -225,6 +226,11 @@ def test_statistics_of_a_column_that_is_not_finite_stay_unchanged():
     new = jnp.array([[2.0, jnp.nan, 2.0, jnp.inf], [3.0, jnp.nan, jnp.inf, 3.0]])
     stats = merge_moments(init_stats((4,)), *new, 2)
     np.testing.assert_allclose((stats.mean, stats.variance), [[2.0, 0.0, 0.0, 0.0], [3.0, 1.0, 1.0, 1.0]])
+
+
+def test_kernels_begin_orthogonal_and_the_last_one_small():
+    for layer, gain in zip(init_mlp(jax.random.key(0), (8, 6, 5, 3), 0.01), (2**0.5, 2**0.5, 0.01), strict=True):
+        np.testing.assert_allclose(layer.kernel.T @ layer.kernel / gain**2, np.eye(len(layer.bias)), atol=1e-5)
 
 
 def test_adam_against_numpy():
