@@ -92,9 +92,9 @@ FOREIGN = {
 
 @cache
 def modules() -> dict[str, Path]:
-    """All modules of the three packages, by dotted name."""
+    """All modules of the three packages and the benchmarks, by dotted name."""
     found = {}
-    for package in PACKAGES:
+    for package in (*PACKAGES, "benchmarks"):
         for path in sorted((ROOT / package).rglob("*.py")):
             name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
             found[name] = path
@@ -113,10 +113,11 @@ def imports(module: str) -> frozenset[str]:
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}: relative import"
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {name if name in modules() else str(node.module) for name in names}
+            found |= {n if {n, f"benchmarks.{n}"} & modules().keys() else str(node.module) for n in names}
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-    return frozenset(name for name in found if name.partition(".")[0] in PACKAGES)
+    found = {f"benchmarks.{name}" if f"benchmarks.{name}" in modules() else name for name in found}
+    return frozenset(name for name in found if name.partition(".")[0] in (*PACKAGES, "benchmarks"))
 
 
 def split(module: str) -> tuple[str, str]:
@@ -132,7 +133,7 @@ def arrows() -> Iterator[tuple[str, str]]:
     for module in modules():
         for other in imports(module):
             assert other in modules(), f"{module} imports {other}, which does not exist"
-            if other != module:
+            if other != module and not module.startswith("benchmarks"):
                 yield module, other
 
 

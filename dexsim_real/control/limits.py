@@ -14,7 +14,7 @@ class SafetyConfig(Config):
     one begin there. What it cuts off a target does not count as a clip."""
     speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
     """Largest rate of change of a command, below the no-load speed of the slower joints (8.6 rad/s). A policy that
-    changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s."""
+    changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s; `rotate` asks for up to 10 and is clipped."""
     reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
     """Distance of a command from the measured angle beyond which it does not move farther away."""
     joint_speed: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0)

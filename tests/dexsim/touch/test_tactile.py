@@ -14,13 +14,12 @@ from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, rotations, sdf, surface_points
 from dexsim.geometry.mesh import load_mesh
 from dexsim.hand.kinematics import HandPose, forward_kinematics, taxel_positions
-from dexsim.touch import reduce as touch_reduce, skin as touch_skin
-from dexsim.touch.reduce import reduce_touch_links
+from dexsim.touch import skin as touch_skin
+from dexsim.touch.reduce import reduce_touch, reduce_touch_links
 from dexsim.touch.skin import MATERIALS, Skin, skin_of
 from dexsim.touch.taxel_force import compute_touch, project_on_normals
 
 EYE = np.eye(3, dtype=np.float32)
-reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
 skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
 
 
