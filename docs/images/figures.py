@@ -251,7 +251,7 @@ def contacts() -> None:
             above.set(title=title, xlim=(-0.7, 9.7), ylim=(-0.7, 11.7), xlabel="column", aspect="equal")
             share = np.full(touching.sum(), 1 / len(taxels))
             below.hist(force[touching], np.arange(0.5, 16), weights=share, histtype="step", color=color, label=name)
-            below.set(xlabel="force on the taxels [N]", ylim=(0, 0.08))
+            below.set_xlabel("force on the taxels [N]")
             print(f"{name}, {title}: touches {touching.mean():.1%}, {force[touching].mean():.1f} N")
     axes[0, 0].set_ylabel("row (tip at the top)")
     axes[1, 0].set_ylabel("share of the time")
