@@ -424,12 +424,12 @@ class TestPool:
         np.testing.assert_allclose(batch.expand("pair_friction")[rows][:, pairs, 0], slide[rows], rtol=1e-5)
 
     def test_candidates_lie_on_the_palm_or_tipped_under_the_middle_finger(self, hand):
-        config = Rotate(RotateConfig(), hand).config
+        config, floor = Rotate(RotateConfig(), hand).config, palm_height(hand) + 0.001
         for key in jax.random.split(jax.random.key(2), 4):
-            object = sample_turned_object(key, config)
-            free, trap = (one(key, object, hand, config) for one in (start._candidate, start._trap_candidate))
-            low = lowest_point(object, free["qpos"][15:], free["qpos"][12:15])
-            assert float(low) == pytest.approx(palm_height(hand) + 0.001, abs=1e-5)
+            drawn = key, sample_turned_object(key, config), hand, config
+            free, trap = jax.device_get([f(*drawn) for f in (start._candidate, start._trap_candidate)])
+            assert lowest_point(drawn[1], free["qpos"][15:], free["qpos"][12:15]) == pytest.approx(floor, abs=1e-5)
+            assert np.abs(free["qpos"][13:15] - config.reference[1:] - config.start_offset).max() <= 0.010
             assert np.flatnonzero(trap["joint_target"] - trap["qpos"][:12] > 0.05).tolist() == [6, 7]
 
     def test_at_rest_is_neither_moving_nor_turning_where_it_belongs(self, hand):
