@@ -122,7 +122,9 @@ def _map_rows() -> Iterator[Row]:
             label=world,
             task="rotate",
             settings=(
-                *(_STEP + sensing + _OBJECTS[object]),
+                *_STEP,
+                *sensing,
+                *_OBJECTS[object],
                 *(_ROUGH if rough else ()),
                 f"observation.leave_out={json.dumps(left_out)}",
             ),

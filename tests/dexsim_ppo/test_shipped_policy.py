@@ -1,14 +1,13 @@
 """The policies in assets/policies: load without a simulator, fit tasks and left hand of today, act, hold and turn."""
 
 import dataclasses
-import functools
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import POOL_SIZE, by_field, reset_to
+from episodes import POOL_SIZE, reset_to
 
 import dexsim
 from dexsim import observation
@@ -103,21 +102,15 @@ def test_the_grasp_holds_and_presses_as_asked(grasp_rollout):
     assert np.all(dropped.any(0))
 
 
-@functools.cache
-def rotation(name):
-    """The environment of a policy, its compiled step, and start states."""
+@pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation", "rotate_clear"])
+def test_the_rotation_policies_turn(name):
+    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
     policy = load_policy(name)
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
     env = dexsim.make(policy.task, dataclasses.replace(config, pool_size=POOL_SIZE), backend="c")
     starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
-    return env, jit(jax.vmap(env.step), once=True), starts
-
-
-@pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation", "rotate_clear"])
-def test_the_rotation_policies_turn(name):
-    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
-    env, step, starts = rotation(name)
-    dropped, _, metrics = play(env, step, starts, 4.0, load_policy(name))
+    step = jit(jax.vmap(env.step), once=True)
+    dropped, _, metrics = play(env, step, starts, 4.0, policy)
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
     if name == "rotate":
@@ -137,9 +130,3 @@ def test_a_right_hands_policy_fits_the_left_one(left, name):
     for part in ("gravity", "reference"):
         np.testing.assert_allclose(getattr(spec, part), getattr(TaskSpec.of(task), part), atol=1e-9)
     assert spec.turn == task.turn and spec.mirror_for(left) == policy.spec
-
-
-def actor_of(env, obs):
-    """The actor's observation without the noise of sensors: the critic's values of its fields."""
-    values = by_field(env.observation_layout["critic"], obs["critic"])
-    return jnp.concatenate([values[entry.name] for entry in env.observation_layout["actor"]])

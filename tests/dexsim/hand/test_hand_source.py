@@ -71,6 +71,16 @@ def test_policy_carries_its_hand(own, tmp_path):
     assert policy.find_hand("elsewhere/xhand_right.toml").digest == record["digest"]
 
 
+def test_the_record_of_a_hand_opens_no_other_file(tmp_path, monkeypatch):
+    """A policy's file may be anybody's: of the files here it may name the TOML of a hand."""
+    monkeypatch.setattr("dexsim.hand.source.load_hand", lambda *_: pytest.fail("it was opened"))
+    (tmp_path / "secret").write_text("a = 1")
+    record = {"digest": "", "joints": [], "fingers": [], "taxels": 1}
+    for file in (tmp_path / "secret", tmp_path, tmp_path / "none.toml", "/dev/zero"):
+        with pytest.raises(ConfigError, match="is missing: give --hand FILE"):
+            recorded_hand(record | {"file": str(file)}, None, "policy.msgpack")
+
+
 def test_changed_files_are_refused_or_warned_of(own):
     policy = dataclasses.replace(load_policy("grasp"), hand=record_of(load_hand(own)))
     heavier(own)
