@@ -12,19 +12,19 @@ bridge. Trial k of a seed does not depend on the other trials. A hand that does 
 """
 
 import argparse
-import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import itertools
 import json
 import multiprocessing
-import multiprocessing.connection
 import os
 import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -105,18 +105,18 @@ def _measured_torque(trace: list[tuple[float, np.ndarray, np.ndarray]], window: 
 
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
     """All trials, seed by seed and in order."""
-    trial, first = functools.partial(run_trial, options), options.get("first", 0)
+    trial, first, reports = functools.partial(run_trial, options), options.get("first", 0), []
     seeds, numbers = zip(*itertools.product(options["seed"], range(first, first + trials)), strict=True)
-    if processes <= 1:
-        return [_shown(report, show) for report in map(trial, seeds, numbers)]
-    with pool(processes) as workers:
-        return [_shown(report, show) for report in workers.map(trial, seeds, numbers)]
-
-
-def pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:
-    """Processes that end with this one. JAX does not support fork."""
-    context = multiprocessing.get_context("spawn")
-    return concurrent.futures.ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
+    with contextlib.ExitStack() as stack:
+        run: Any = map
+        if processes > 1:
+            spawn = multiprocessing.get_context("spawn")  # JAX does not support fork.
+            run = stack.enter_context(ProcessPoolExecutor(processes, spawn, initializer=_end_with_parent)).map
+        for report in run(trial, seeds, numbers):
+            reports.append(report)
+            if show:
+                print(_line(report), file=sys.stderr, flush=True)
+    return reports
 
 
 def _end_with_parent() -> None:
@@ -125,22 +125,19 @@ def _end_with_parent() -> None:
     assert parent is not None
 
     def watch() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
+        parent.join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
-    if show:
-        result = (
-            f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
-            if report["task"] == "grasp"
-            else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
-        )
-        line = f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)"
-        print(line, file=sys.stderr, flush=True)
-    return report
+def _line(report: dict[str, Any]) -> str:
+    result = (
+        f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
+        if report["task"] == "grasp"
+        else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
+    )
+    return f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)"
 
 
 # --- metrics and tables ---------------------------------------------------------------------------------

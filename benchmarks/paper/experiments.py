@@ -1,5 +1,6 @@
 """The experiments: each table and figure as rows, with the paper's numbers; docs/results.md says what differs."""
 
+import functools
 import itertools
 import json
 from collections.abc import Iterator
@@ -190,14 +191,14 @@ _ALL = (
             Row(name=name, label=label, task="rotate", policy="rotate", ablate=ablate)
             for name, label, ablate in _READINGS
         ),
-        measure=measure.measured("simulation"),
+        measure=functools.partial(measure.measured, worlds=("simulation",)),
         table=tables.rotation,
     ),
     Experiment(
         name="force",
         title="Force and torque over the command, shipped grasp policy",
         rows=(Row(name="grasp", label="shipped policy", task="grasp", policy="grasp"),),
-        measure=measure.measured("simulation", "hand"),
+        measure=functools.partial(measure.measured, worlds=("simulation", "hand")),
         table=tables.commands,
         draw=figures.command_curves,
     ),
@@ -211,7 +212,7 @@ _ALL = (
                 ("rotate_without_orientation", "no orientation", "no_orientation"),
             )
         ),
-        measure=measure.measured("hand"),
+        measure=functools.partial(measure.measured, worlds=("hand",)),
         table=tables.rotation,
         draw=figures.successes,
     ),

@@ -24,7 +24,7 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
 from dexsim_real.twin.plant.parameters import skill_of
-from paper.data import BUDGETS, ROOT, Budget, Measure, Row
+from paper.data import BUDGETS, ROOT, Budget, Row
 from paper.held_out import NAMES, HeldOutGrasp
 
 TOUCH = ("contact_force", "contact_centre")
@@ -34,8 +34,8 @@ FOREIGN = str(ROOT / "assets" / "plants" / "foreign_right.xml")
 
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """Train a seed of a row, or finish its training; then measure the policy in both worlds, and of a row that says
-    what the emulated hand draws on a foreign plant as well, and in simulation without touch and with that of another
-    episode.
+    what the emulated hand draws on a foreign plant as well. There a policy that observes touch is also measured in
+    simulation without it ("ablated") and with the touch of another episode ("another").
 
     A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
@@ -49,35 +49,21 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     }
     if row.plant:
         report["foreign"] = trials(task, policy, seed, budget.name, given, FOREIGN)
-        report |= without_touch(loaded, budget)
+        if {entry.name for entry in loaded.observation_layout}.issuperset(TOUCH):
+            report["ablated"] = simulate(loaded.ablate(*TOUCH), (), budget)
+            report["another"] = simulate(loaded, (), budget, AnotherTouch)
     return report | {"training": training}
 
 
-def without_touch(policy: Policy, budget: Budget) -> dict[str, Any]:
-    """What a policy that observes touch does in simulation without it ("ablated") and with the touch of another episode
-    ("another"); nothing of one that does not."""
-    if not {entry.name for entry in policy.observation_layout}.issuperset(TOUCH):
-        return {}
-    ablated = simulate(policy.ablate(*TOUCH), (), budget)
-    return {"ablated": ablated, "another": simulate(policy, (), budget, AnotherTouch)}
-
-
-def measured(*worlds: str) -> Measure:
-    """How a shipped policy is measured, with observation fields ablated, in "simulation", on the emulated "hand", or in
+def measured(row: Row, seed: int, budget: Budget, work: Path, *, worlds: Sequence[str]) -> dict[str, Any]:
+    """A shipped policy, with the row's observation fields ablated, in "simulation", on the emulated "hand", or in
     both."""
-
-    def measure(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-        del work
-        report = {}
-        if "simulation" in worlds:
-            policy = load_policy(row.policy)
-            policy = policy.ablate(*row.ablate) if row.ablate else policy
-            report["simulation"] = simulate(policy, row.settings, budget)
-        if "hand" in worlds:
-            report["hand"] = trials(row.skill, row.policy, seed, budget.name)
-        return report
-
-    return measure
+    report = {}
+    if "simulation" in worlds:
+        report["simulation"] = simulate(load_policy(row.policy).ablate(*row.ablate), row.settings, budget)
+    if "hand" in worlds:
+        report["hand"] = trials(row.skill, row.policy, seed, budget.name)
+    return report
 
 
 def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[str, dict[str, Any]]:
