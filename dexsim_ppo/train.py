@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -99,12 +99,11 @@ def train_policy(
     source = find_source(task, str(policy), resume)
     if not (task or source):
         raise ConfigError(f"train_policy: give a task, one of {', '.join(catalog()['tasks'])}")
-    default = default_arguments(task, preset, source)
     if options.get("run_dir"):
         options["run_dir"] = Path(options["run_dir"])
     given = {"env": config, "ppo": ppo, "policy": str(policy) or None} | options
-    default = _with_budget(default, {name for name, value in options.items() if value is not None})
-    arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    arguments = dataclasses.replace(_with_budget(default_arguments(task, preset, source), given.keys()), **given)
     run, stopped = train(arguments, source, started, "train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -243,10 +242,10 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
         return arguments_from_dict(find_task(task or saved["task"]).config_class, saved)
 
 
-def _with_budget(default: TrainArguments, given: set[str]) -> TrainArguments:
+def _with_budget(default: TrainArguments, given: Collection[str]) -> TrainArguments:
     """The defaults without their own steps where minutes alone are given, and the other way round."""
     other = {"steps": "minutes", "minutes": "steps"}
-    lifted: dict[str, Any] = {other[name]: 0.0 for name in given & other.keys() if other[name] not in given}
+    lifted: dict[str, Any] = {other[name]: 0.0 for name in other.keys() & given if other[name] not in given}
     return dataclasses.replace(default, **lifted)
 
 
@@ -272,8 +271,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, Source]:
         source = find_source(given.task, given.policy, given.resume)
         default = default_arguments(given.task, preset, source)
     default = _with_budget(default, {name for name, value in vars(given).items() if value})
-    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
-    options = generic[type(default.env)]
+    options = cast(Any, TrainArguments)[type(default.env)]  # a static checker knows no type found at run time
     arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
     return dataclasses.replace(arguments, task=default.task), source
 

@@ -187,29 +187,24 @@ def progress_line(row: dict[str, Any]) -> str:
 
 def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
     """The learning curve over environment steps, with the evaluations, as a PNG."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure  # one that no window shows
 
     names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
     if not names:
         return
-    figure, axes = plt.subplots(
-        len(names), 1, figsize=(7, 1.9 * len(names)), sharex=True, squeeze=False, layout="constrained"
-    )
+    figure = Figure(figsize=(7, 1.9 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), sharex=True, squeeze=False)[:, 0]
 
     def draw(ax: Any, name: str, style: str, **options: Any) -> None:
         points = [(1e-6 * row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
         if points:
             ax.plot(*zip(*points, strict=True), style, **options)
 
-    for ax, name in zip(axes[:, 0], names, strict=True):
+    for ax, name in zip(axes, names, strict=True):
         draw(ax, name, "-", lw=1.2)
         ax.set_ylabel(METRICS[name][0])
         ax.grid(alpha=0.3)
-    draw(axes[0, 0], "evaluation/return", "o", ms=4, label="evaluation")
-    axes[0, 0].set_title(f"{title}, {rows[-1]['seconds'] / 60:.1f} min", loc="left")
-    axes[-1, 0].set_xlabel("environment steps [million]")
+    draw(axes[0], "evaluation/return", "o", ms=4, label="evaluation")
+    axes[0].set_title(f"{title}, {rows[-1]['seconds'] / 60:.1f} min", loc="left")
+    axes[-1].set_xlabel("environment steps [million]")
     figure.savefig(path, dpi=120)
-    plt.close(figure)

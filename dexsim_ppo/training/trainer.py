@@ -1,5 +1,6 @@
 """One training run: compile, loop, measure, save, report."""
 
+import contextlib
 import dataclasses
 import functools
 import shlex
@@ -55,7 +56,7 @@ class Run:
         self.without_better = 0  # evaluations in a row
         self.seconds_before = 0.0
         """Wall-clock time before a resume, s."""
-        self.clock = {"setup_s": time.perf_counter() - started}
+        self.clock: dict[str, float] = {}
 
     def _evaluation_env(self) -> Environment:
         """The training environment, or one of its own where training has extremes or no force loop."""
@@ -81,11 +82,8 @@ class Run:
         processes.print_on_first(f"compiled in {self.clock['compile_s']:.1f} s")
         resumed = source if isinstance(source, checkpoint.Checkpoint) else None
         log = MetricsLog(self.folder, self.arguments, resumed) if processes.is_first() else None
-        try:
+        with contextlib.closing(log) if log else contextlib.nullcontext():
             self._loop(state, step, log, stopped)
-        finally:
-            if log:
-                log.close()
 
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
@@ -251,7 +249,6 @@ class Run:
         arguments, folder, selected = self.arguments, self.folder, self.selected
         first = "" if self.evaluations_s else "; the first evaluation compiles for about a minute"
         print(f"evaluating {selected.name} and a hand that does nothing{first}", flush=True)
-        begin = time.perf_counter()
         trained = load_policy(selected)
         if trained.training.get("iteration") == 0:
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
@@ -259,7 +256,6 @@ class Run:
         reports = {}
         reports["trained"], film = measure(trained.params, label="trained")
         reports["do_nothing"], _ = measure(trained.params, idle=True, label="doing nothing")
-        self.clock["evaluation_s"] = time.perf_counter() - begin
         print_report(reports["trained"], reports["do_nothing"], title=f"{arguments.task}: {selected.name}")
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
