@@ -63,12 +63,9 @@ class Begin:
     push: jax.Array  # [3] N on the object: what turns the scene's gravity into the motion's
 
 
-@dataclasses.dataclass
-class Trace:
-    """What a motion was, [T, B, ...] each, at the end of every control tick."""
-
-    place: np.ndarray  # [3] m
-    force: np.ndarray  # [F + 1, 3] N: on each finger at that moment, and on the object by the hand, mean of the tick
+Trace = tuple[np.ndarray, np.ndarray]
+"""What motions were at the end of every control tick: place [T, B, 3] m of the object, and forces [T, B, F + 1, 3] N on
+each finger at that moment, and on the object by the hand, mean of the tick."""
 
 
 class Motions:
@@ -233,20 +230,19 @@ class Motions:
         velocity = np.concatenate([np.asarray(begin.state.qvel)[None], qvel])[..., physics.object_dof[:3]]
         acceleration = np.diff(velocity, axis=0) / self.env.control_period - np.asarray(self.env.task.gravity)
         on_object = np.asarray(begin.object.mass)[:, None] * acceleration - np.asarray(begin.push)
-        place = qpos[..., physics.object_qpos[:3]]
-        return Trace(place, np.concatenate([finger_force, on_object[:, :, None]], 2))
+        return qpos[..., physics.object_qpos[:3]], np.concatenate([finger_force, on_object[:, :, None]], 2)
 
     def compare(self, found: Trace, wanted: Trace) -> list[dict[str, Any]]:
         """A row for each motion and shape: how far an engine's motions are from others."""
-        place = 1e3 * np.linalg.norm(found.place - wanted.place, axis=-1)
-        force, strength = np.linalg.norm(found.force - wanted.force, axis=-1), np.linalg.norm(wanted.force, axis=-1)
-        touching, rows = np.maximum(strength, np.linalg.norm(found.force, axis=-1)) > TOUCHING, []
+        place, force = (np.linalg.norm(x - y, axis=-1) for x, y in zip(found, wanted, strict=True))
+        found_strength, strength = (np.linalg.norm(trace[1], axis=-1) for trace in (found, wanted))
+        touching, rows = np.maximum(strength, found_strength) > TOUCHING, []
         for motion, shape in dict.fromkeys(self.cases):
             mine = [case == (motion, shape) for case in self.cases]
             row: dict[str, Any] = {"task": self.task, "motion": motion, "shape": shape, "n": sum(mine)}
             touched = touching[:, mine]
             row["force_n"] = float(strength[:, mine][touched].mean())
-            for name, values in (("place_mm", place[:, mine]), ("force_error_n", force[:, mine][touched])):
+            for name, values in (("place_mm", 1e3 * place[:, mine]), ("force_error_n", force[:, mine][touched])):
                 row |= {f"{name}_p95": float(np.percentile(values, 95)), f"{name}_max": float(values.max())}
             rows.append(row)
         return rows
