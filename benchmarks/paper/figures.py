@@ -73,8 +73,9 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
     for axis, (name, label) in zip(axes, names.items(), strict=True):
         for color, row in zip(COLORS, experiment.rows, strict=False):
             for world, style in (("simulation", "-"), ("hand", "--")):
-                command, middle, low, high = _curve(seeds(reports.get(row.name)), world, name)
-                if len(command):
+                results = [seed[world]["by_command"] for seed in seeds(reports.get(row.name))]
+                if results:
+                    command, middle, low, high = _curve(results, name)
                     text = f"{row.label}, {'emulated hand' if world == 'hand' else world}"
                     axis.plot(command, middle, style, color=color, lw=1.5, label=text)
                     axis.fill_between(command, low, high, color=color, alpha=0.15, lw=0)
@@ -84,11 +85,8 @@ def command_curves(experiment: Experiment, reports: Reports, folder: Path) -> No
     _save(figure, folder / "force_and_torque.svg")
 
 
-def _curve(results: list[dict[str, Any]], world: str, name: str) -> tuple[np.ndarray, ...]:
+def _curve(rows: list[list[dict[str, Any]]], name: str) -> tuple[np.ndarray, ...]:
     """Commands, mean, lower and upper end of the band: the interval of one seed, the span of several."""
-    rows = [seed[world]["by_command"] for seed in results]
-    if not rows:
-        return (np.zeros(0),) * 4
     command = np.array([row["command"] for row in rows[0]])
     # [seeds, commands] each; None becomes NaN.
     mean, low, high = (np.array([[r[name][k] for r in seed] for seed in rows], float) for k in ("mean", "low", "high"))

@@ -37,7 +37,7 @@ def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
     return list(report["seeds"].values()) if report else []
 
 
-def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
+def how(row: Row, report: dict[str, Any] | None) -> str:
     """Where a row's numbers are from."""
     if not report:
         return UNTRAINED
@@ -81,7 +81,7 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
                 cell({"median": s[key]["median"]} for s in worlds),
                 cell(s["seconds_to_fall"] for s in worlds),
             ]
-        lines.append([*line, how(experiment, row, report)])
+        lines.append([*line, how(row, report)])
     return lines
 
 
@@ -102,7 +102,7 @@ def touch_map(experiment: Experiment, reports: Reports) -> list[list[str]]:
         pair = [seeds(reports.get(each.name)) for each in (row, without)]
         cells = [cell(mean_turns(seed, world) for seed in each) for world in worlds for each in pair]
         cells += [cell(mean_turns(seed, way) for seed in pair[0]) for way in ("ablated", "another")]
-        lines.append([row.label, *cells, how(experiment, row, reports.get(row.name))])
+        lines.append([row.label, *cells, how(row, reports.get(row.name))])
     return lines
 
 
@@ -125,7 +125,7 @@ def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
                 cell(s.get("r_torque") for s in results),
                 cell(s.get("slope_force_n") for s in results),
             ]
-        lines.append([*line, how(experiment, row, report)])
+        lines.append([*line, how(row, report)])
     return lines
 
 
