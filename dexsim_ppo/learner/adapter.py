@@ -2,11 +2,20 @@
 
     training = make_train(my_env, PPOConfig())
 
-`python -m dexsim_ppo.train --task my_module:make_env` does the same with what `make_env()` returns.
+`python -m dexsim_ppo.train --task my_module:make_env` does the same with what `make_env()` returns. The members are
+sizes, and pure functions of one state, an arbitrary pytree:
+
+    observation_size, action_size, max_steps: int
+    reset(key) -> (observation [observation_size], state)   of a new episode
+    step(key, state, action) -> (observation, state, reward [], terminated [] bool)
+
+Actions [action_size] are in [-1, 1]. Steps restart nothing and know no time limit: `max_steps` is kept by the learner,
+and an episode that it cuts is bootstrapped, not terminated. An environment may also have `control_period` (s) and
+`metrics(state) -> {name: scalar}`, which are logged and reported.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,28 +32,9 @@ CONTROL_PERIOD = 0.05
 MEMBERS = ("observation_size", "action_size", "max_steps", "reset", "step")
 
 
-class SimpleEnvironment(Protocol):
-    """What an environment must have to be trained: pure functions of one state, an arbitrary pytree.
-
-    It may also have `control_period` (s) and `metrics(state) -> {name: scalar}`, which are logged and reported.
-    """
-
-    observation_size: int
-    action_size: int
-    max_steps: int
-    """Time limit of an episode. The learner keeps it: an episode that it cuts is bootstrapped, not terminated."""
-
-    def reset(self, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Observation [observation_size] and state of a new episode."""
-
-    def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
-        """Observation, state, reward [] and whether the episode terminated [] (bool) after an action [action_size] in
-        [-1, 1]. No restart, and no time limit."""
-
-
 @pytree_dataclass
 class AdaptedState:
-    """State of an adapted environment; see `types.State`."""
+    """State of an adapted environment; see `types.Environment`."""
 
     inner: Any
     obs: dict[str, jax.Array]
@@ -65,11 +55,11 @@ class Plan(NamedTuple):
 
 
 class Adapted:
-    """A `SimpleEnvironment` as the learner's `Environment`, with the members of an evaluation; see `adapt`."""
+    """An environment of five members as the learner's `Environment`, with the members of an evaluation; see `adapt`."""
 
     backend, evaluation, config = "own", "series", NoSettings()
 
-    def __init__(self, env: SimpleEnvironment, name: str):
+    def __init__(self, env: Any, name: str):
         if missing := [member for member in MEMBERS if not hasattr(env, member)]:
             raise ConfigError(f"environment {name!r}: a {type(env).__name__} has no {', '.join(missing)}")
         self.name, self._env = name, env
@@ -136,6 +126,6 @@ class Adapted:
 
 
 def adapt(env: Any, name: str = "") -> Environment:
-    """`env` itself if it is an `Environment`, else a wrapper of a `SimpleEnvironment`; its name is that of its class by
+    """`env` itself if it is an `Environment`, else a wrapper of its five members, whose name is that of its class by
     default. Raises ConfigError: a member is missing."""
     return env if hasattr(env, "observation_layout") else Adapted(env, name or type(env).__name__)

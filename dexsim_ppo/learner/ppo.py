@@ -49,7 +49,7 @@ def make_train(
     """Compiled `init` and `step`.
 
     Args:
-      env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
+      env: an `Environment`, or any object with the members that `learner.adapter` lists.
       mesh: devices to spread the environments over (`learner.sharding`); None for one.
       start: from a fresh learner's state to that which training starts from; None for the same.
     """

@@ -1,6 +1,5 @@
 """What the learner requires of an environment, and what it carries from one iteration to the next."""
 
-from collections.abc import Mapping
 from typing import Any, Protocol
 
 import jax
@@ -11,22 +10,14 @@ from dexsim_ppo.learner.networks import GRU, MLP, Params
 from dexsim_ppo.learner.running_stats import RunningStats
 
 
-class State(Protocol):
-    """State of one environment: a pytree. Callers add batch axes with `jax.vmap`."""
-
-    obs: Mapping[str, jax.Array]
-    """`"actor"` [n] and `"critic"` [m]. After `step` and before `restart` it is the true final observation."""
-    reward: jax.Array
-    terminated: jax.Array
-    """bool []: the episode reached a terminal state. Takes precedence over `truncated`."""
-    truncated: jax.Array
-    """bool []: the time limit cut the episode; its value is bootstrapped."""
-    metrics: Mapping[str, jax.Array]
-    """Scalars of this step; `"return"` and `"length"` are sums over the episode so far."""
-
-
 class Environment(Protocol):
-    """Pure functions of one environment's state.
+    """Pure functions of one environment's state, to which callers add batch axes with `jax.vmap`: a pytree with
+
+      obs: `"actor"` [n] and `"critic"` [m]; after `step` and before `restart` the true final observation.
+      reward: [].
+      terminated: bool [], the episode reached a terminal state. Takes precedence over `truncated`.
+      truncated: bool [], the time limit cut the episode; its value is bootstrapped.
+      metrics: scalars of this step by name; `"return"` and `"length"` are sums over the episode so far.
 
     A curriculum also needs `reset(key, scale)` and `set_randomization_scale(state, scale)`, with the width [] of the
     randomisation ranges in [0, 1].
