@@ -111,8 +111,9 @@ class Run:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         per_iteration = self.config.steps_per_iteration
         iteration = first = int(state.iteration)
-        begin, calls_s = time.perf_counter(), list[float]()
-        faults, evaluated = Faults(self.config, self.folder, state), iteration == 0
+        begin, calls_s, evaluated = time.perf_counter(), list[float](), iteration == 0
+        # Updates skipped so far, the last iteration without one, and calls in a row that skipped most.
+        self.skipped, self.sound, self.bad_calls = int(state.skipped_updates), iteration, 0
         while not stopped() and not processes.agree(self._is_over(iteration)):
             call = time.perf_counter()
             state, metrics = step(state)
@@ -122,7 +123,7 @@ class Run:
             if len(calls_s) == 1:
                 self.clock["first_update_s"] = time.perf_counter() - self.started
                 processes.print_on_first(f"first update {self.clock['first_update_s']:.1f} s after the start")
-            faults.check(int(metrics["skipped_updates"][-1]), iteration)
+            self._check_faults(int(metrics["skipped_updates"][-1]), iteration)
             rate = per_call * per_iteration / calls_s[-1]
             row = means(metrics) | {
                 "iteration": iteration,
@@ -147,6 +148,22 @@ class Run:
         if self.best["return"] is not None and not stopped() and not evaluated:
             self._evaluate(state, iteration)
         self._save(state, iteration)
+
+    def _check_faults(self, skipped: int, iteration: int) -> None:
+        """Raises DexsimError: most updates of several calls in a row were `skipped`, their number in the whole run,
+        because their gradient was not finite."""
+        lost, self.skipped = skipped - self.skipped, skipped
+        updates = self.config.iterations_per_call * self.config.epochs * self.config.minibatches
+        self.bad_calls = self.bad_calls + 1 if 2 * lost > updates else 0
+        if not lost:
+            self.sound = iteration
+        if self.bad_calls >= DIVERGED_AFTER:
+            sound = [path for path in self.folder.existing_checkpoints() if int(path.stem) <= self.sound]
+            raise DexsimError(
+                f"training diverged: in each of the last {DIVERGED_AFTER} calls most gradients were not finite, the "
+                f"first one after iteration {self.sound}; "
+                + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
+            )
 
     # --- budgets ------------------------------------------------------------------------------------------
 
@@ -280,29 +297,6 @@ class Run:
             print(f"see it in the browser: dexsim view {shlex.quote(str(selected))}")
         resume = f"dexsim train --resume {shlex.quote(str(folder.path))}{module}"
         print(f"train longer: {resume}, with a larger --minutes or --steps")
-
-
-class Faults:
-    """Counts updates that were skipped because their gradient was not finite."""
-
-    def __init__(self, config: PPOConfig, folder: RunFolder, state: TrainState):
-        self._per_call = config.iterations_per_call * config.epochs * config.minibatches
-        self._folder, self._skipped, self._sound = folder, int(state.skipped_updates), int(state.iteration)
-        self._bad_calls = 0
-
-    def check(self, skipped: int, iteration: int) -> None:
-        """Raises DexsimError: most updates of several calls in a row were `skipped`, which counts all of the run's."""
-        lost, self._skipped = skipped - self._skipped, skipped
-        self._bad_calls = self._bad_calls + 1 if 2 * lost > self._per_call else 0
-        if not lost:
-            self._sound = iteration
-        if self._bad_calls >= DIVERGED_AFTER:
-            sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._sound]
-            raise DexsimError(
-                f"training diverged: in each of the last {DIVERGED_AFTER} calls most gradients were not finite, the "
-                f"first one after iteration {self._sound}; "
-                + (f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before")
-            )
 
 
 def initialize_from(policy: Policy, state: TrainState) -> TrainState:
