@@ -108,7 +108,7 @@ class RecordArguments(Config):
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
     arguments = cli.parse(RecordArguments, argv)
-    if arguments.lerobot is None and arguments.rrd is None and arguments.npz is None:
+    if not (arguments.lerobot or arguments.rrd or arguments.npz):
         raise ConfigError("give --lerobot FOLDER, --rrd FILE or --npz FILE")
     policy = load_policy(arguments.policy, task=arguments.task)
     # First what could be wrong after minutes of simulation.
@@ -117,9 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_lerobot(arguments.lerobot)
     if arguments.rrd:
         require("rerun", "rerun", "a recording for the rerun viewer")
-        cli.check_writable(arguments.rrd)
-    if arguments.npz:
-        cli.check_writable(arguments.npz)
+    for path in filter(None, (arguments.rrd, arguments.npz)):
+        cli.check_writable(path)
     cli.enable_caches()
     env = policy.make_env()
     trajectories, snapshots = record(

@@ -17,8 +17,6 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.twin.plant.parameters import skill_of
 
 ROOT = Path(__file__).resolve().parents[2]
-REPORTS = ROOT / "docs" / "results"
-"""Reports in the repository, of which the page of results is made."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,6 @@ from typing import Any
 from paper.data import Experiment, Row
 
 Reports = dict[str, dict[str, Any]]
-UNTRAINED = "not trained yet"
 
 
 def cell(entries: Iterable[dict[str, Any] | None]) -> str:
@@ -40,7 +39,7 @@ def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
 def how(row: Row, report: dict[str, Any] | None) -> str:
     """Where a row's numbers are from."""
     if not report:
-        return UNTRAINED
+        return "not trained yet"
     count = len(report["seeds"])
     trained = [seed["training"] for seed in seeds(report) if seed.get("training")]
     if not trained:

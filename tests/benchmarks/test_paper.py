@@ -8,7 +8,8 @@ import pytest
 from paths import ROOT
 
 pytest.importorskip("serial")
-if not (ROOT / "docs" / "results").exists():
+RESULTS = ROOT / "docs" / "results"
+if not RESULTS.exists():
     pytest.skip("needs a checkout", allow_module_level=True)
 
 
@@ -65,7 +66,7 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
 
 def test_committed_tables_agree_with_the_reports(paper):
     for experiment in paper.experiments.EXPERIMENTS.values():
-        path = paper.data.REPORTS / experiment.name / "table.md"
+        path = RESULTS / experiment.name / "table.md"
         if path.exists():
-            reports = paper.command.reports_of(experiment, paper.data.REPORTS)
+            reports = paper.command.reports_of(experiment, RESULTS)
             assert path.read_text() == paper.command.markdown(experiment.table(experiment, reports)) + "\n"
