@@ -88,19 +88,13 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
     ]
     report = run.report()
     if options["task"] == "grasp":
-        report["total_torque"] = _measured_torque(trace, report["window_s"])
+        # As the bridge measures it, over the window after the object is let go: sum over touching fingers of the root
+        # joint's torque as a share of its limit.
+        begin, end = report["window_s"]
+        window = [entry for entry in trace if begin <= entry[0] - trace[0][0] < end]
+        sums = [float(np.abs(torque)[force > 0.0].sum()) for _, torque, force in window]
+        report["total_torque"] = round(float(np.mean(sums)), 4) if sums else 0.0
     return report | {"wall": round(time.perf_counter() - began, 2)}
-
-
-def _measured_torque(trace: list[tuple[float, np.ndarray, np.ndarray]], window: list[float]) -> float:
-    """Sum over touching fingers of the root joint's torque as a share of its limit, as the bridge measures it: mean
-    over the window [s]. The first entry of time, torque [F] and force [F] is when the object is let go."""
-    sums = [
-        float(np.abs(torque)[force > 0.0].sum())
-        for time, torque, force in trace
-        if window[0] <= time - trace[0][0] < window[1]
-    ]
-    return round(float(np.mean(sums)), 4) if sums else 0.0
 
 
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:

@@ -115,18 +115,14 @@ def swept(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     if len(points) > sweep["points"]:
         points = (points[0], points[-1])
     for point in points or (None,):
-        report = simulate(policy, sweep_settings(row, point), budget)
+        settings = [] if point is None else [setting.format(point, point) for setting in row.settings]
+        report = simulate(policy, settings, budget)
         names = ("held", "r_taxels", "r_resultant", "force_error_n")
         if row.skill == "rotate":
             names = ("kept_to_the_end", "successes_per_minute", "seconds_to_fall", "successes")
             report["successes"] = report["successes"]["mean"]
         results.append({"point": point} | {name: report[name] for name in names})
     return {"points": results}
-
-
-def sweep_settings(row: Row, point: float | None) -> list[str]:
-    """The row's settings at one point; None leaves training's ranges."""
-    return [] if point is None else [setting.format(point, point) for setting in row.settings]
 
 
 class AnotherTouch(Evaluator):

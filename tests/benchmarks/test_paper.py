@@ -53,7 +53,7 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
         for row in experiment.rows:
             if row.points:
                 entry, policy = find_task(row.task), load_policy(row.policy)
-                settings = [paper.measure.sweep_settings(row, point) for point in row.points]
+                settings = [[setting.format(point, point) for setting in row.settings] for point in row.points]
                 changed = [override(policy.env_config, change) for change in settings]
                 found = {json.dumps(to_dict(from_dict(entry.config_class, config))) for config in changed}
                 assert len(found) == len(row.points)
