@@ -30,9 +30,6 @@ from dexsim.hand.load import load_hand
 from dexsim.observation import FIELDS
 from dexsim_ppo.policy import Policy, load_policy
 
-_OPSET = 17
-_KEY = "dexsim"  # of the header among the model's properties
-
 
 def to_onnx(policy: Policy, path: Path) -> None:
     """Write an ONNX model: input `observation` [batch, n], output `action` [batch, A], float32. One with a memory also
@@ -84,9 +81,9 @@ def to_onnx(policy: Policy, path: Path) -> None:
         inputs, outputs = [*inputs, port("carry", units)], [*outputs, port("next_carry", units)]
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
     graph = helper.make_graph(nodes, policy.task, inputs, outputs, tensors)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     header = json.dumps({"task": policy.task} | cli.plain(policy.header()))
-    helper.set_model_props(model, {_KEY: header})
+    helper.set_model_props(model, {"dexsim": header})
     checker.check_model(model)
     write_atomic(path, [model.SerializeToString()])
 

@@ -97,10 +97,6 @@ class Row:
         return skill_of(self.task)
 
 
-Measure = Callable[[Row, int, Budget, Path], dict[str, Any]]
-"""`measure(row, seed, budget, work)`: the report of one seed; `work` is the folder of its training."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
     """A table, and figures of it."""
@@ -108,7 +104,7 @@ class Experiment:
     name: str
     title: str
     rows: tuple[Row, ...]
-    measure: Measure
+    measure: Callable[[Row, int, Budget, Path], dict[str, Any]]  # of a row and seed; the path is its training's folder
     table: Callable[["Experiment", dict[str, dict]], list[list[str]]]  # header and rows, from the reports by row
     draw: Callable[["Experiment", dict[str, dict], Path], None] | None = None  # writes figures into a folder
     training_seeds: int = 0  # training runs of each row; 0: nothing is trained

@@ -27,8 +27,6 @@ from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner.types import Environment
 
-CONTROL_PERIOD = 0.05
-"""Length of a step, s, where an environment does not say; only reports and policies speak of it."""
 MEMBERS = ("observation_size", "action_size", "max_steps", "reset", "step")
 
 
@@ -64,7 +62,7 @@ class Adapted:
             raise ConfigError(f"environment {name!r}: a {type(env).__name__} has no {', '.join(missing)}")
         self.name, self._env = name, env
         self.action_size, self.evaluation_steps = int(env.action_size), int(env.max_steps)
-        self.control_period = float(getattr(env, "control_period", CONTROL_PERIOD))
+        self.control_period = float(getattr(env, "control_period", 0.05))  # only reports and policies speak of it
         # One vector for both networks, scaled by its running statistics.
         layout = (LayoutEntry("observation", int(env.observation_size)),)
         self.observation_layout: dict[str, tuple[LayoutEntry, ...]] = {"actor": layout, "critic": layout}
