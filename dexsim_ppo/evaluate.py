@@ -274,11 +274,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     arguments = cli.parse(EvaluateArguments, argv)
     cli.enable_caches()
-    video = arguments.video
-    for path in (arguments.output, video):
-        if path:
-            cli.check_writable(path)
-    cli.check_no_overwrite({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
+    outputs = {"--output": arguments.output, "--video": arguments.video}
+    for path in filter(None, outputs.values()):
+        cli.check_writable(path)
+    cli.check_no_overwrite(outputs, {"policy": arguments.policy})
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
