@@ -23,10 +23,8 @@ class Checkpoint:
 
     path: Path
     task: str
-    content: dict[str, Any]
-    """Plain data: configurations, observation layout and the like."""
-    leaves: dict[str, Any]
-    """Arrays, and typed PRNG keys, by path."""
+    content: dict[str, Any]  # plain data: configurations, observation layout and the like
+    leaves: dict[str, Any]  # arrays, and typed PRNG keys, by path
 
 
 def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], tree: Any) -> None:

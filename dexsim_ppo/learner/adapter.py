@@ -40,8 +40,7 @@ class AdaptedState:
     terminated: jax.Array
     truncated: jax.Array
     metrics: dict[str, jax.Array]
-    clock: jax.Array
-    """Steps towards the time limit []; `randomize_episode_time` sets it."""
+    clock: jax.Array  # [] steps towards the time limit; `randomize_episode_time` sets it
     key: jax.Array
 
 

@@ -11,7 +11,7 @@ from dexsim_ppo.learner.running_stats import RunningStats
 
 
 class Environment(Protocol):
-    """Pure functions of one environment's state, to which callers add batch axes with `jax.vmap`: a pytree with
+    """Pure functions of one environment's state; callers add batch axes with `jax.vmap`. It is a pytree with
 
       obs: `"actor"` [n] and `"critic"` [m]; after `step` and before `restart` the true final observation.
       reward: [].
@@ -23,18 +23,12 @@ class Environment(Protocol):
     randomisation ranges in [0, 1].
     """
 
-    name: str
-    """The task's name."""
-    backend: str
-    """The physics backend; "own" for an environment from elsewhere."""
-    config: Any
-    """The task's configuration."""
-    action_size: int
-    """Length of the action (A)."""
-    observation_layout: dict[str, tuple[LayoutEntry, ...]]
-    """Layout of the `"actor"` and `"critic"` observations."""
-    control_period: float
-    """Length of one control tick, s."""
+    name: str  # of the task
+    backend: str  # of the physics; "own" for an environment from elsewhere
+    config: Any  # of the task
+    action_size: int  # A
+    observation_layout: dict[str, tuple[LayoutEntry, ...]]  # of the `"actor"` and `"critic"` observations
+    control_period: float  # s, length of one control tick
 
     def reset(self, key: jax.Array) -> Any:
         """A new episode."""
@@ -66,8 +60,7 @@ class TrainState:
     """All that training carries from one iteration to the next."""
 
     params: Params
-    average: tuple[MLP, GRU | None]
-    """Actor and memory, averaged over the last iterations: what a policy is made of."""
+    average: tuple[MLP, GRU | None]  # of actor and memory over the last iterations: what a policy is made of
     adam: AdamState
     learning_rate: jax.Array  # []
     observation_stats: dict[str, RunningStats]

@@ -54,8 +54,7 @@ class Run:
         self.best: dict[str, Any] = {"return": None, "iteration": 0}
         self.evaluations_s = list[float]()
         self.without_better = 0  # evaluations in a row
-        self.seconds_before = 0.0
-        """Wall-clock time before a resume, s."""
+        self.seconds_before = 0.0  # s, wall-clock time before a resume
         self.clock: dict[str, float] = {}
 
     def _evaluation_env(self) -> Environment:
