@@ -67,19 +67,15 @@ class HandDriver(Protocol):
 
         Raises HandError: the hand does not answer, or is another one.
         """
-        ...
 
     def send(self, targets: JointTargets) -> None:
         """Send joint targets, or turn the motors off."""
-        ...
 
     def read(self) -> DriverState | None:
         """A state measured after the last `send`; None when no valid answer arrived in time."""
-        ...
 
     def close(self) -> None:
         """Close the line; no error where it is closed already."""
-        ...
 
 
 class DriverPort(HandPort):
@@ -89,10 +85,7 @@ class DriverPort(HandPort):
         super().__init__(config, passive_command(hand.num_joints))
         self.driver, self._hand = driver, hand
         self._block = driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)
-
-    @property
-    def missing(self) -> list[str]:
-        return [name for name in WITHOUT if name not in self.driver.measures]
+        self.missing = [name for name in WITHOUT if name not in driver.measures]
 
     def warnings(self) -> list[str]:
         """One line for each thing that this hand does not measure."""
