@@ -26,7 +26,7 @@ from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import BAUD, ImuReader
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
-from dexsim_real.twin.wire import CAMERA_RATE, FORCE_PER_COUNT, IMU_RATE, Firmware, ImuFrames, picture
+from dexsim_real.twin.wire import CAMERA_RATE, FORCE_PER_COUNT, IMU_RATE, Firmware, imu_frames, picture
 from dexsim_real.wire.frames import HOST, Command, Frame, decode, palm_address
 from dexsim_real.wire.link import BITS_PER_BYTE, HandPort, Reply
 
@@ -112,10 +112,10 @@ class VirtualPort(HandPort):
 
 def virtual_imu(port: VirtualPort, seed: int) -> ImuReader:
     """The bridge's reader of the IMU in the object, without a terminal."""
-    reader, frames = ImuReader(), ImuFrames(port.plant, seed)
+    reader, frames = ImuReader(), imu_frames(port.plant, seed)
 
     def sample() -> None:
-        data = frames.sample()
+        data = next(frames)
         arrival = port.time + BITS_PER_BYTE * len(data) / BAUD
         port.events.enterabs(arrival, 0, reader.receive, (arrival, data))
 

@@ -8,16 +8,17 @@ board, and the bytes of the answer, forwarded in chunks like a USB adapter does.
 (mean 9.60 ms, 95 % below 9.63 ms, maximum 10.7 ms).
 
 The sensors of the object: noise, bias, drift and delay come from the plant; this module adds formats, rates and lost
-pictures. `ImuFrames` and `picture` are what they send; `EmulatedImu` serves it on a terminal, `EmulatedCamera` on a
+pictures. `imu_frames` and `picture` are what they send; `EmulatedImu` serves it on a terminal, `EmulatedCamera` on a
 Unix socket.
 """
 
 import contextlib
+import itertools
 import os
 import socket
 import tty
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -195,7 +196,6 @@ class HandLine:
         return self._tasks[0][0] if self._tasks else np.inf
 
     def serve(self, now: float) -> None:
-        """Do what is due."""
         data, rng = self.terminal.read(), self._rng
         if not data and now - self._heard > _SILENCE:
             self._parser.feed(b"", final=True)
@@ -230,21 +230,15 @@ class HandLine:
 # --- sensors of the object --------------------------------------------------------------------------
 
 
-class ImuFrames:
-    """The RVC frames of the IMU, like a BNO08x. Its world frame has the true vertical as z and an arbitrary heading."""
-
-    def __init__(self, plant: EmulatedHand, seed: int):
-        self.sent, self._plant = 0, plant
-        up = plant.up
-        level = np.array([1.0 + up[2], up[1], -up[0], 0.0])  # turns the vertical to z
-        self._world = product(turn((0, 0, 1), 1.0 + seed), level / np.linalg.norm(level))
-
-    def sample(self) -> bytes:
-        """The bytes of the current orientation and acceleration."""
-        _, quat, specific_force = self._plant.measure_object()
-        self.sent += 1
-        acceleration = matrix(_MOUNT).T @ specific_force
-        return encode(self.sent, product(self._world, product(quat, _MOUNT)), tuple(acceleration))
+def imu_frames(plant: EmulatedHand, seed: int) -> Iterator[bytes]:
+    """The RVC frames of the IMU, like a BNO08x, each measured when it is taken. Its world frame has the true vertical
+    as z and an arbitrary heading."""
+    up = plant.up
+    level = np.array([1.0 + up[2], up[1], -up[0], 0.0])  # turns the vertical to z
+    world = product(turn((0, 0, 1), 1.0 + seed), level / np.linalg.norm(level))
+    for index in itertools.count(1):
+        _, quat, specific_force = plant.measure_object()
+        yield encode(index, product(world, product(quat, _MOUNT)), tuple(matrix(_MOUNT).T @ specific_force))
 
 
 def picture(plant: EmulatedHand, optics: CameraConfig) -> np.ndarray:
@@ -294,7 +288,7 @@ class EmulatedImu:
     """The emulated IMU on a terminal of its own: call `serve` when `due`; missed samples are skipped."""
 
     def __init__(self, link: Path, plant: EmulatedHand, seed: int, start: float):
-        self.terminal, self.frames, self.due = Terminal(link), ImuFrames(plant, seed), start
+        self.terminal, self._frames, self.due = Terminal(link), imu_frames(plant, seed), start
         self.option = "--imu", str(link)  # of the runner
 
     def close(self) -> None:
@@ -304,7 +298,7 @@ class EmulatedImu:
         """Send a sample at a time in s."""
         self.due = max(self.due + 1 / IMU_RATE, now)
         self.terminal.read()  # It ignores what it receives.
-        self.terminal.write(self.frames.sample())
+        self.terminal.write(next(self._frames))
 
 
 class EmulatedCamera:
