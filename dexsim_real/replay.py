@@ -79,7 +79,6 @@ class Replay:
         self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
 
     def _add(self, record: Record) -> None:
-        """Take in a later record."""
         content, report = record.content, self.report
         if record.kind == Kind.META:
             self._tares.append((content["from"], content["tare"]))
@@ -119,7 +118,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReplayArguments:
-    """Options of `python -m dexsim_real.replay`."""
+    """Recompute and plot the log of a run on the hand."""
 
     log: Annotated[Path, tyro.conf.Positional]
     """Log file of `python -m dexsim_real.run`."""
@@ -138,12 +137,7 @@ class ReplayArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
-    arguments = cli.parse(
-        ReplayArguments,
-        argv,
-        prog="python -m dexsim_real.replay",
-        description="Recompute and plot the log of a run on the hand.",
-    )
+    arguments = cli.parse(ReplayArguments, argv)
     outputs = {"--plot": arguments.plot, "--rrd": arguments.rrd, "--output": arguments.output}
     cli.check_no_overwrite(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
     for path in filter(None, outputs.values()):

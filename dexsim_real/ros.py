@@ -136,7 +136,6 @@ class HandNode:
 
 
 def main(argv: Any = None) -> int:
-    """The command."""
     import rclpy
 
     prepare_jax()

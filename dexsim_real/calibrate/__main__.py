@@ -95,13 +95,8 @@ def table(calibration: Calibration, joints: Mapping[str, JointFit], hand: Hand) 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code."""
-    arguments = cli.parse(
-        CalibrateArguments,
-        argv,
-        prog="python -m dexsim_real.calibrate",
-        description=__doc__.splitlines()[0],
-    )
+    about = __doc__.splitlines()[0]
+    arguments = cli.parse(CalibrateArguments, argv, prog="python -m dexsim_real.calibrate", description=about)
     for path in (arguments.destination, arguments.plot):
         if path:
             cli.check_writable(path)

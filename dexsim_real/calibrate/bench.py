@@ -120,7 +120,6 @@ class CalibrateArguments(LoopConfig):
 
     @property
     def destination(self) -> Path:
-        """Output file."""
         return self.output or Path("hand.json" if self.identify else "hand.toml")
 
 
@@ -135,7 +134,6 @@ class Operator:
         self._stream = stream or sys.stdin or io.StringIO()  # Python has no `sys.stdin` where it was closed.
 
     def tell(self, text: str) -> None:
-        """Print one line."""
         print(text, file=self.out, flush=True)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str | None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import grp
 import importlib
 import os
 import termios
@@ -42,10 +41,10 @@ def explain(port: str, error: Exception) -> str:
     """One line about a port that does not open: the reason and the remedy."""
     number = getattr(error, "errno", None)
     if number == errno.EACCES:
-        group, name = os.stat(port).st_gid, ""
+        group = str(os.stat(port).st_gid)
         with contextlib.suppress(KeyError):  # A container need not know the group of a device that it was given.
-            name = grp.getgrgid(group).gr_name
-        return f"{port}: permission denied; run `sudo usermod -aG {name or group} $USER`, then log out and in again"
+            group = Path(port).group()
+        return f"{port}: permission denied; run `sudo usermod -aG {group} $USER`, then log out and in again"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: another program has it open (`fuser -v {port}` names it). Close that program first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):

@@ -41,8 +41,6 @@ class LogError(DexsimError):
 
 
 class Kind(enum.IntEnum):
-    """Kind of a record."""
-
     META = 1  # configuration of the run
     SENT = 2  # (number of the exchange, frame) from the host
     RECEIVED = 3  # the same from the hand
@@ -136,7 +134,6 @@ class LogWriter(contextlib.AbstractContextManager):
 
 
 def encode(kind: Kind, when: float, content: Any) -> bytes:
-    """The bytes of a record."""
     payload = msgpack.packb([int(kind), when, content], default=_pack_array)
     return _HEAD.pack(SYNC, len(payload), zlib.crc32(payload)) + payload
 

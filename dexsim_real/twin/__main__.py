@@ -36,7 +36,7 @@ MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TwinArguments(Config):
-    """Options of `python -m dexsim_real.twin`."""
+    """Emulate a hand on a pseudo-terminal."""
 
     task: str = setting("rotate", choices=TASKS)
     """Task: `rotate` mounts the hand palm up with a cube, `grasp` upside down with various objects."""
@@ -125,23 +125,15 @@ class Twin:
             self.now += step
 
     def close(self) -> None:
-        """Close all ports."""
         self.line.terminal.close()
         self.sensor.close()
 
     def note(self, text: str) -> None:
-        """Show an event, with its time."""
         self._show(f"{time.monotonic() - self.start:9.3f} s  {text}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code, 0."""
-    arguments = cli.parse(
-        TwinArguments,
-        argv,
-        prog="python -m dexsim_real.twin",
-        description="Emulate a hand on a pseudo-terminal.",
-    )
+    arguments = cli.parse(TwinArguments, argv)
     if arguments.output:
         cli.check_writable(arguments.output)
     hand = load_hand(arguments.hand or None)
