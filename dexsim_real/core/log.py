@@ -24,7 +24,6 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim_real.core.process import BACKGROUND, change_priority
-from dexsim_real.core.stream import FrameParser
 
 MAGIC = b"DXSLOG2\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
@@ -32,7 +31,6 @@ _HEAD = struct.Struct("<4sII")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
-_CHUNK = 1 << 20  # bytes that are searched at once
 _LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
 
 
@@ -154,13 +152,19 @@ class LogReader:
             raise LogError(f"{self.path}: this is not a log of `dexsim_real`; give a .log file of a run")
 
     def __iter__(self) -> Iterator[Record]:
-        parser = FrameParser(SYNC, _HEAD.size, _size, _decode)
-        self.damaged = len(self._data) - len(MAGIC)
-        for begin in range(len(MAGIC), len(self._data), _CHUNK):
-            chunk = self._data[begin : begin + _CHUNK]
-            for size, record in parser.feed(chunk, final=begin + _CHUNK >= len(self._data)):
-                self.damaged -= size
-                yield record
+        data, at = self._data, len(MAGIC)
+        self.damaged = len(data) - at
+        while (at := data.find(SYNC, at)) >= 0 and at + _HEAD.size <= len(data):
+            _, size, checksum = _HEAD.unpack_from(data, at)
+            end = at + _HEAD.size + size
+            payload = data[end - size : end] if size <= _LONGEST else b""
+            if len(payload) < size or zlib.crc32(payload) != checksum:
+                at += 1  # An intact record may begin within a damaged one.
+                continue
+            self.damaged -= end - at
+            at = end
+            kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
+            yield Record(Kind(kind), when, content)
 
 
 @contextlib.contextmanager
@@ -175,20 +179,6 @@ def reading(path: str | Path) -> Iterator[None]:
         raise
     except Exception as error:
         raise LogError(f"{path}: invalid record ({type(error).__name__}: {error}); record again") from error
-
-
-def _size(head: bytes) -> int:
-    size = _HEAD.unpack(head)[1]
-    return _HEAD.size + size if size <= _LONGEST else 0
-
-
-def _decode(data: bytes) -> tuple[int, Record] | None:
-    """Size and content of a record; None of a damaged one."""
-    payload = data[_HEAD.size :]
-    if zlib.crc32(payload) != _HEAD.unpack_from(data)[2]:
-        return None
-    kind, when, content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-    return len(data), Record(Kind(kind), when, content)
 
 
 def _pack_array(value: Any) -> Any:
