@@ -26,7 +26,7 @@ from dexsim.observation import Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.alarms import finger_joints
 from dexsim_real.control.controller import make_observe, prepare_jax
-from dexsim_real.core.log import Kind, LogError, LogReader, Record, reading
+from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 
 
@@ -45,12 +45,21 @@ class Replay:
         reader, notes = LogReader(path), list[str]()
         with reading(path):
             for record in reader:
-                if record.kind == Kind.META and "from" not in record.content:
-                    self._begin(path, record.content, hand)
-                elif record.kind == Kind.NOTE:
-                    notes.append(f"{record.time:.3f} {record.content}")
-                elif self.report:
-                    self._add(record)
+                content = record.content
+                if record.kind == Kind.NOTE:
+                    notes.append(f"{record.time:.3f} {content}")
+                elif record.kind == Kind.META and "from" not in content:
+                    self._begin(path, content, hand)
+                elif not self.report:
+                    continue  # It is of the connection, or of the tare.
+                elif record.kind == Kind.META:
+                    self._tares.append((content["from"], content["tare"]))
+                elif record.kind == Kind.RECEIVED:
+                    self.report["frames"] += 1
+                elif record.kind == Kind.TICK:
+                    self._compare(record.time, content)
+                elif record.kind == Kind.END:
+                    self.report["ended"] = content["end"]
         if not self.report:
             raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
         self.time = np.array(self._times) - (self._times[0] if self._times else 0.0)  # [T] s since the first tick
@@ -77,17 +86,6 @@ class Replay:
         self.report |= dict.fromkeys(("frames", "readings_same", "observations_same"), 0)
         self.report |= {"first_difference": None, "ended": "truncated", "recorded_on": meta["environment"]}
         self._tares = [(0, np.array(meta["tare"], np.float32))]  # and the number of the exchange from which on it holds
-
-    def _add(self, record: Record) -> None:
-        content, report = record.content, self.report
-        if record.kind == Kind.META:
-            self._tares.append((content["from"], content["tare"]))
-        elif record.kind == Kind.RECEIVED:
-            report["frames"] += 1
-        elif record.kind == Kind.TICK:
-            self._compare(record.time, content)
-        elif record.kind == Kind.END:
-            report["ended"] = content["end"]
 
     def _compare(self, time: float, tick: dict[str, Any]) -> None:
         # The exchange thread may have changed the tare before the tick's record was written.
