@@ -75,7 +75,7 @@ class Twin:
         self.start = self.now = time.monotonic()  # s; the plant's time by the wall clock
         self.slipped, self._noted_at = 0.0, -math.inf  # s
         terminal = Terminal(folder / "hand")
-        self.line = HandLine(terminal, Firmware(plant, self.note), self.catch_up, arguments.seed)
+        self.line = HandLine(terminal, Firmware(plant), self.catch_up, arguments.seed)
         try:
             kind, name = (EmulatedCamera, "masks") if arguments.task == "grasp" else (EmulatedImu, "imu")
             self.sensor: EmulatedImu | EmulatedCamera = kind(folder / name, plant, arguments.seed, self.start)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig, camera_axes, encode_mask
@@ -33,8 +33,7 @@ from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode, Parser, passive_command
 from dexsim_real.wire.link import SERIAL_NUMBER, SIDE, LinkConfig
 
-OVERHEATED = 1
-"""Error bit of a joint, defined by this board: too hot and off."""
+OVERHEATED = 1  # error bit of a joint, defined by this board: too hot and off
 VERSION = "1.3.9 emulated"
 SERIALS = {"right": "2R32EMULATED", "left": "2L32EMULATED"}
 FORCE_PER_COUNT = 0.1  # N of one taxel count
@@ -58,11 +57,10 @@ _MOUNT = np.array(UPRIGHT_X)
 
 
 class Firmware:
-    """Executes frames on a plant; `note` is called with one line when the motors turn on or off."""
+    """Executes frames on a plant."""
 
-    def __init__(self, plant: EmulatedHand, note: Callable[[str], None] = lambda text: None):
-        self.plant, self._note = plant, note
-        side = plant.hand.side
+    def __init__(self, plant: EmulatedHand):
+        self.plant, side = plant, plant.hand.side
         self._registers = {SERIAL_NUMBER.to_bytes(2, "little"): SERIALS[side], SIDE.to_bytes(2, "little"): side}
         self.motors = passive_command()  # `frames.COMMAND_BLOCK` that the joints execute
         self._hot = np.zeros(frames.JOINTS, bool)
@@ -113,14 +111,12 @@ class Firmware:
             return _FORCE_MODE
         if not np.isfinite(block["position"]).all():
             return _PARAMETER
-        measured, was_on = self.plant.measure(), self.motors["mode"].any()
+        measured = self.plant.measure()
         hot = measured.temperature
         self._hot = (hot > SHUTDOWN) | (self._hot & (hot > SHUTDOWN - 10.0))
         block["mode"][self._hot] = Mode.PASSIVE
         self.motors = block
         self.plant.drive(block)
-        if was_on != (on := block["mode"].any()):
-            self._note("motors on" if on else "motors off")
         return self.state(measured).tobytes()
 
 
@@ -265,22 +261,17 @@ def outline(part: Primitive) -> np.ndarray:
 
 
 def silhouette(parts: list[np.ndarray], optics: CameraConfig) -> np.ndarray:
-    """The mask [rows, columns], bool, of convex bodies, each of points [N, 3] m in the palm frame.
-
-    Bodies that extend behind the camera are not seen.
-    """
+    """The mask [rows, columns], bool, of convex bodies in front of the camera, each of points [N, 3] m in the palm
+    frame."""
     mask = np.zeros(PICTURE[::-1], bool)
     for points in parts:
         x, y, depth = camera_axes(optics) @ (points - optics.position).T
-        if depth.min() < 1e-3:
-            continue
         pixels = np.stack([x / depth, y / depth], 1) * optics.focal + optics.centre
         low = np.clip(np.floor(pixels.min(0)), 0, PICTURE).astype(int)
         high = np.clip(np.ceil(pixels.max(0)) + 1, 0, PICTURE).astype(int)
         grid = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1)
-        with contextlib.suppress(QhullError):  # A body that projects to a line covers no pixel.
-            sides = ConvexHull(pixels).equations  # a x + b y + c <= 0 inside
-            mask[low[1] : high[1], low[0] : high[0]] |= (grid @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
+        sides = ConvexHull(pixels).equations  # a x + b y + c <= 0 inside
+        mask[low[1] : high[1], low[0] : high[0]] |= (grid @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
     return mask
 
 

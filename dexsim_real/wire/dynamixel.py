@@ -19,12 +19,9 @@ from dexsim_real.wire.driver import DriverState, HandDriver, JointTargets
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
-READ_ALL, WRITE_ALL, STATUS = 0x82, 0x83, 0x55
-"""Instructions: sync read, sync write, and a motor's answer."""
-ALERT = 0x80
-"""Bit of an answer's error: the motor's hardware error status is not 0. The other bits say why a request failed."""
-POSITION_BY_CURRENT = 5
-"""Operating mode: position control within a current limit."""
+READ_ALL, WRITE_ALL, STATUS = 0x82, 0x83, 0x55  # instructions: sync read, sync write, and a motor's answer
+ALERT = 0x80  # bit of an answer's error: its hardware error status is not 0; the others say why a request failed
+POSITION_BY_CURRENT = 5  # operating mode: position control within a current limit
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
 _TICK = 2 * np.pi / 4096  # rad
 _MIDDLE = 2048  # ticks

@@ -25,8 +25,7 @@ import numpy as np
 from dexsim_real.twin.plant.parameters import Start, skill_of
 from dexsim_real.twin.plant.shapes import matrix, product, turn
 
-LIMITS = {"grasp": 8.0, "rotate": 120.0}
-"""Time limit in s of a trial, by task."""
+LIMITS = {"grasp": 8.0, "rotate": 120.0}  # s, time limit of a trial
 LOST = {"grasp": 0.12, "rotate": 0.07}  # m, drop radius
 GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = 0.3, 0.05, 2.0  # rad, m, rad/s
 _FASTEST = {"task": GOAL_SPIN, "paper": math.inf}  # rad/s about the axis at which a goal counts
