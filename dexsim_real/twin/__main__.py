@@ -67,7 +67,7 @@ class TwinArguments(Config):
 class Twin:
     """An emulated hand with its ports, in a folder; `show` is called with one line for every event.
 
-    Raises HandError: a port or socket cannot be created.
+    Raises HandError or OSError: a port or socket cannot be created.
     """
 
     def __init__(self, arguments: TwinArguments, plant: EmulatedHand, folder: Path, show: Callable[[str], None]):

@@ -293,10 +293,7 @@ class EmulatedImu:
 
 
 class EmulatedCamera:
-    """The emulated camera, and the program that sends its masks to the client of a socket; called as `EmulatedImu`.
-
-    Raises HandError: the socket cannot be created.
-    """
+    """The emulated camera, and the program that sends its masks to the client of a socket; called as `EmulatedImu`."""
 
     def __init__(self, path: Path, plant: EmulatedHand, seed: int, start: float):
         self.path, self.due = path, start
@@ -305,12 +302,9 @@ class EmulatedCamera:
         self._client: socket.socket | None = None
         self._waiting = b""  # what the client has not read yet
         self._server = socket.socket(socket.AF_UNIX)
-        try:
-            self._server.bind(str(path))
-        except OSError as error:
-            self._server.close()
-            why = error.strerror or error
-            raise HandError(f"{path}: the socket for masks cannot be created ({why}); remove the file") from None
+        if path.is_socket():  # of a program that was killed
+            path.unlink()
+        self._server.bind(str(path))
         self._server.listen()
         self._server.setblocking(False)
 
