@@ -78,7 +78,8 @@ class ExchangeLoop:
 
     def cycle(self) -> HandSample | None:
         """One exchange; None without an answer. `Safety.problem` tells whether the sample is a measurement."""
-        self._beat()
+        if self.guard:
+            self.guard.beat()
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -125,17 +126,14 @@ class ExchangeLoop:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._closed, seconds = True, PATIENCE if self.driven else BRIEF
-        self._beat(seconds)
+        if self.guard:
+            self.guard.beat(seconds)
         try:
             if self.port.turn_off(off, seconds):
                 self.driven = False
         finally:
             with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
                 self.port.close()
-
-    def _beat(self, more: float = 0.0) -> None:
-        if self.guard:
-            self.guard.beat(more)
 
     def _sample(self, reply: Reply) -> HandSample:
         if self.track_taxels:

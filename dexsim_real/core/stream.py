@@ -10,7 +10,7 @@ class FrameParser(Generic[T]):
     """Extracts frames from a damaged or truncated stream; memory is bounded by one frame and one chunk.
 
     Where a frame cannot be decoded the search continues one byte after its head, so every intact frame of the stream is
-    found. `frames` and `damaged` count them.
+    found. `frames` and `damaged` count them; `pending` has the bytes of an incomplete one.
 
     Args:
       head: bytes with which each frame begins.
@@ -20,19 +20,14 @@ class FrameParser(Generic[T]):
 
     def __init__(self, head: bytes, header: int, size: Callable[[bytes], int], decode: Callable[[bytes], T | None]):
         self._head, self._header, self._size, self._decode = head, header, size, decode
-        self._buffer = bytearray()
+        self.pending = bytearray()
         self.frames = self.damaged = 0
-
-    @property
-    def pending(self) -> int:
-        """Number of bytes of an incomplete frame."""
-        return len(self._buffer)
 
     def feed(self, data: bytes, final: bool = False) -> list[T]:
         """Add received bytes; returns the frames that they complete. The last of a transmission if `final`: that drops
         an incomplete frame, and returns the frames inside its bytes."""
-        self._buffer += data
-        buffer, contents, at, done = self._buffer, list[T](), 0, 0
+        self.pending += data
+        buffer, contents, at, done = self.pending, list[T](), 0, 0
         while (at := buffer.find(self._head, at)) >= 0:
             complete = at + self._header <= len(buffer)
             size = self._size(bytes(buffer[at : at + self._header])) if complete else self._header

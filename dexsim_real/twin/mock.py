@@ -29,16 +29,16 @@ class MockHand(HandDriver):
 
     def connect(self) -> str:
         self._time = self._clock()
-        self._drive(passive_command(self.plant.hand.num_joints))
+        self.motors = passive_command(self.plant.hand.num_joints)
+        self.plant.drive(self.motors)
         return f"mock of {self.plant.hand.name}"
 
     def send(self, targets: JointTargets) -> None:
         self._advance()
         mode = Mode.POSITION if targets.on else Mode.PASSIVE
-        current = np.round(1e3 * targets.current)
-        self._drive(
-            command_block(targets.position, kp=targets.kp, ki=targets.ki, kd=targets.kd, torque_max=current, mode=mode)
-        )
+        gains = {name: getattr(targets, name) for name in ("kp", "ki", "kd")}
+        self.motors = command_block(targets.position, mode, torque_max=np.round(1e3 * targets.current), **gains)
+        self.plant.drive(self.motors)
 
     def read(self) -> DriverState:
         self._advance()
@@ -58,10 +58,6 @@ class MockHand(HandDriver):
         now = self._clock()
         self.plant.advance(min(now - self._time, _SLIP))
         self._time = now
-
-    def _drive(self, motors: np.ndarray) -> None:
-        self.motors = motors
-        self.plant.drive(motors)
 
 
 def open_hand(hand: Hand, link: LinkConfig) -> MockHand:

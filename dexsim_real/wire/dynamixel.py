@@ -33,15 +33,11 @@ _HEALTH_EVERY = 8  # reads between two looks at torque and errors of motors that
 
 
 class Register:
-    """A range of the control table: its address, and the type of its fields."""
+    """A range of the control table: the type of its fields, and its `span`, address and size as requests have them."""
 
     def __init__(self, address: int, *fields: tuple[str, str]):
-        self.address, self.dtype = address, np.dtype(list(fields))
-
-    @property
-    def span(self) -> bytes:
-        """Address and size, as requests have them."""
-        return self.address.to_bytes(2, "little") + self.dtype.itemsize.to_bytes(2, "little")
+        self.dtype = np.dtype(list(fields))
+        self.span = address.to_bytes(2, "little") + self.dtype.itemsize.to_bytes(2, "little")
 
 
 SETTINGS = Register(9, ("return_delay", "u1"), ("drive_mode", "u1"), ("operating_mode", "u1"))

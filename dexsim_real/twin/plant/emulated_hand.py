@@ -181,16 +181,6 @@ class EmulatedHand:
         qpos, scene, at = self._data.qpos.copy(), self._scene, self._scene.object_qpos
         return qpos[scene.drive_qpos] + qpos[scene.play_qpos], qpos[at : at + 3], qpos[at + 3 : at + 7]
 
-    @property
-    def up(self) -> np.ndarray:
-        """[3] the true vertical in the palm frame."""
-        return -self._gravity / GRAVITY
-
-    @property
-    def limit(self) -> float:
-        """Time limit of a trial in s."""
-        return self._referee.limit
-
     def results(self) -> list[dict[str, Any]]:
         """True results of all trials so far, including the current one; JSON-able."""
         return [*self._done] if self._finished else [*self._done, self._report()]
@@ -221,6 +211,7 @@ class EmulatedHand:
         self._enter(scene, rng)
         self._place, self._pushes = place, Pushes(parameters, rng.spawn(1)[0])
         self._referee = Referee(self.task, self.start, self.seconds, self.hand.num_fingers)
+        self.limit = self._referee.limit  # s, of a trial
         put(scene, self._data, place.position + _SHELF, place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._remember()
@@ -229,6 +220,7 @@ class EmulatedHand:
         """The scene of another object, in which `_enter` begins."""
         self.parameters, self.shape = parameters, shape
         self._gravity = tilted(self.start.gravity, parameters.gravity_tilt)
+        self.up = -self._gravity / GRAVITY  # [3] the true vertical in the palm frame
         return build_scene(self._model, parameters, shape, self._gravity)
 
     def _enter(self, scene: Scene, rng: np.random.Generator) -> None:

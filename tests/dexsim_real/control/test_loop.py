@@ -101,7 +101,7 @@ def test_the_guard_is_armed_gets_signs_of_life_and_is_told_whether_the_motors_ar
         raise HandError("the guard")
 
     told, signs, begin = [], [], loop.port.now
-    beat = lambda more: signs.append((more, loop.port.now))  # noqa: E731
+    beat = lambda more=0.0: signs.append((more, loop.port.now))  # noqa: E731
     loop.guard = SimpleNamespace(beat=beat, dismiss=lambda off: told.append(off), check=fail, arm=fail)
     run(loop, AGREEING)
     for call in (loop.engage, loop.check):

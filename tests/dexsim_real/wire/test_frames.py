@@ -97,5 +97,5 @@ def test_damage_costs_only_the_damaged_frames(seed):
         size = int(rng.choice([7, 62, 512, 4096]))
         for at in range(0, len(stream), size):
             received += parser.feed(stream[at : at + size])
-        assert parser.pending < longest and received == sent[: len(received)]
+        assert len(parser.pending) < longest and received == sent[: len(received)]
     assert received + parser.feed(b"", final=True) == sent
