@@ -158,7 +158,7 @@ class LogReader:
             _, size, checksum = _HEAD.unpack_from(data, at)
             end = at + _HEAD.size + size
             payload = data[end - size : end] if size <= _LONGEST else b""
-            if len(payload) < size or zlib.crc32(payload) != checksum:
+            if not payload or len(payload) < size or zlib.crc32(payload) != checksum:
                 at += 1  # An intact record may begin within a damaged one.
                 continue
             self.damaged -= end - at

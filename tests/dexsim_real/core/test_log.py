@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, strategies as st
 from paths import ROOT
 
-from dexsim_real.core.log import MAGIC, Kind, LogError, LogReader, LogWriter, encode
+from dexsim_real.core.log import MAGIC, SYNC, Kind, LogError, LogReader, LogWriter, encode
 
 
 def test_what_goes_in_comes_out_in_order(tmp_path):
@@ -50,7 +50,7 @@ def test_a_cut_or_damage_anywhere_costs_the_records_that_it_hits(small, tmp_path
     got = [record.content for record in LogReader(path)]
     # The first ten records are of one size.
     assert got == whole[: len(got)] and len(got) >= min((at - len(MAGIC)) // size, 10)
-    path.write_bytes(small[:at] + bytes([small[at] ^ bits]) + small[at + 1 :])
+    path.write_bytes(small[:at] + bytes([small[at] ^ bits]) + small[at + 1 :] + SYNC + bytes(bits))  # and blocks of 0
     reader = LogReader(path)
     got = [record.content for record in reader]
     assert len(got) == 19 and set(got) < set(whole) and reader.damaged > 0
