@@ -51,14 +51,14 @@ COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @functools.lru_cache(maxsize=2)
-def load(name: str, idle: bool, hand: str = "") -> Controller:
+def load(name: str, idle: bool, hand: str = "", axis: tuple[float, ...] = ()) -> Controller:
     """The controller of a policy; loaded once per process. An idle policy's actions are zero."""
     prepare_jax()
     policy = load_policy(name)
     if idle:
         layers = jax.tree.map(np.zeros_like, policy.params.layers)
         policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=layers))
-    controller = Controller(policy, load_hand(hand))
+    controller = Controller(policy, load_hand(hand), axis)
     controller.warm()
     return controller
 
@@ -66,8 +66,9 @@ def load(name: str, idle: bool, hand: str = "") -> Controller:
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """One trial: the referee's report, with the bridge's measurements as `bridge`."""
     # As in the task's evaluation: five commands for each shape.
+    axis = tuple(options.get("axis", ()))
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    controller = load(options["policy"], options.get("idle", False), options.get("hand", ""))
+    controller = load(options["policy"], options.get("idle", False), options.get("hand", ""), axis)
     plant = EmulatedHand(
         controller.hand,
         options["task"],
@@ -77,6 +78,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         seconds=options["seconds"],
         trials=1,
         first=number,
+        axis=axis,
         shape_name=shape,
         plant_model=options.get("plant_model"),
     )
@@ -275,6 +277,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--task", choices=TASKS, required=True)
     add("--policy", help="policy file; by default the shipped policy of the task")
     add("--hand", default="", help="TOML or name of a hand with the XHand's joints and taxels")
+    add("--axis", type=float, nargs=3, default=(), help="of rotation, for a policy trained with several")
     add("--trials", type=int, default=10, help="of each seed")
     add("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")

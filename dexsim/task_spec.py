@@ -28,6 +28,8 @@ class TurnSpec(Config):
 
     axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
     """Axis of rotation in the palm frame, of any length; (1, 0, 0) is the palm's normal."""
+    axes: tuple[tuple[float, float, float], ...] = setting((), unit="1", low=-1.0, high=1.0)
+    """Axes that can be commanded, one for an episode, of cubes; a training episode draws one. Empty: `axis` alone."""
     step: float = setting(np.pi / 2, unit="rad", low=-np.pi, high=np.pi)
     """Angle from one goal to the next; negative for turning the other way."""
     angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
@@ -39,14 +41,21 @@ class TurnSpec(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if np.linalg.norm(self.axis) < 1e-6:
-            raise ConfigError("TurnSpec.axis is (0, 0, 0): give a direction")
+        if any(np.linalg.norm(axis) < 1e-6 for axis in (self.axis, *self.axes)):
+            raise ConfigError("TurnSpec: (0, 0, 0) among its axes: give a direction")
         if abs(self.step) < 0.1:
             raise ConfigError(f"TurnSpec.step = {self.step:g} rad: must be at least 0.1 rad to either side")
 
+    def about(self, axis: tuple[float, ...]) -> "TurnSpec":
+        """The turn about one of `axes`. Raises ConfigError: another axis."""
+        if axis not in self.axes:
+            raise ConfigError(f"axis {axis}: the policy can be told {self.axes or 'no axis'}")
+        return dataclasses.replace(self, axis=axis)
+
     def mirror(self) -> "TurnSpec":
         """The turn in a mirror: the mirrored axis, the other way round."""
-        return dataclasses.replace(self, axis=mirror_point(self.axis), step=-self.step)
+        axes = tuple(mirror_point(axis) for axis in self.axes)
+        return dataclasses.replace(self, axis=mirror_point(self.axis), axes=axes, step=-self.step)
 
     @property
     def unit_axis(self) -> np.ndarray:

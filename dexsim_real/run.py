@@ -75,6 +75,8 @@ class RunArguments(LoopConfig):
     """The TOML of a hand of your own, where it is not in the place that the policy's file names."""
     command: float = setting(0.5, unit="1", low=0.0, high=1.0)
     """Grip command in [0, 1]."""
+    axis: tuple[float, ...] = setting((), unit="1", low=-1.0, high=1.0)
+    """Axis to turn about, for a policy trained with several (`--env.turn.axes`); empty: the palm's normal, 1 0 0."""
     seconds: float = setting(30.0, unit="s", low=0.1, high=86400.0)
     """Duration of the run, after the approach."""
     motors_off: bool = False
@@ -245,7 +247,7 @@ class Session:
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.port = open_port(arguments.port, hand, arguments.link)
         self.port.tap = self._tap
-        self.controller = Controller(policy, calibrated_hand(hand, calibration))
+        self.controller = Controller(policy, calibrated_hand(hand, calibration), arguments.axis)
         self.controller.check_measured(self.port.missing)
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
         self.controller.warm()

@@ -75,17 +75,21 @@ def sources_of(names: Sequence[str]) -> set[str]:
 
 
 class Controller:
-    """The policy between readings and joint targets.
+    """The policy between readings and joint targets. `axis` [3] is the one to turn about, for a policy that can be told
+    (`TurnSpec.axes`), as a right hand does it; a left one does the mirror image.
 
-    Raises HandError: the policy observes what its task does not give or no sensor can measure, or gives another number
-    of actions than the hand has joints.
+    Raises ConfigError: the policy cannot turn about it. Raises HandError: the policy observes what its task does not
+    give or no sensor can measure, or gives another number of actions than the hand has joints.
     """
 
-    def __init__(self, policy: Policy, hand: Hand):
+    def __init__(self, policy: Policy, hand: Hand, axis: tuple[float, ...] = ()):
         self.policy, self.hand = policy, hand
         if policy.spec is None:
             raise HandError(f"the policy of the task {policy.task!r} carries no task specification")
-        self.spec = policy.spec.mirror_for(hand)
+        spec = policy.spec
+        if axis:
+            spec = dataclasses.replace(spec, turn=(spec.turn or TurnSpec()).about(axis))
+        self.spec = spec.mirror_for(hand)
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
         self.sources = sources_of(select_fields(names, config))

@@ -50,6 +50,8 @@ class TwinArguments(Config):
     """Number of the first trial. A trial does not depend on the trials before it."""
     seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
     """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
+    axis: tuple[float, ...] = setting((), unit="1", low=-1.0, high=1.0)
+    """Axis of rotation, as given to the run; empty: that of the task."""
     parameters: str = setting("outside", choices=KINDS)
     """Parameters of hand and object: just outside the ranges of training, inside them, or nominal."""
     folder: Path | None = None
@@ -141,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as temporary:
         folder = arguments.folder or Path(temporary)
         show = functools.partial(print, flush=True)
-        options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "plant_model")}
+        options = {name: getattr(arguments, name) for name in ("trials", "first", "seconds", "axis", "plant_model")}
         plant = EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.parameters, **options)
         twin = Twin(arguments, plant, folder, show)
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -153,6 +155,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = ["python", "-m", "dexsim_real.run", arguments.task, "--port", port]
         command += ["--calibration", str(calibration), "--yes", *twin.sensor.option]
         command += ["--hand", arguments.hand] if arguments.hand else []
+        command += ["--axis", *map(str, arguments.axis)] if arguments.axis else []
         try:
             show(f"{arguments.task}: the emulated hand is at {port}. Run a policy on it with")
             show(f"    {shlex.join(command)}")

@@ -121,7 +121,7 @@ class RotateConfig(EnvConfig):
         if other := set(self.objects.shapes) - {"box", "cylinder"}:
             raise ConfigError(f"RotateConfig.objects.shapes names {sorted(other)[0]!r}: expected box or cylinder")
         cubes = self.objects.shapes == ("box",) and self.proportions == (1.0, 1.0)
-        if not cubes and abs(self.turn.unit_axis[0]) < 1 - 1e-9:
+        if not cubes and (self.turn.axes or abs(self.turn.unit_axis[0]) < 1 - 1e-9):
             raise ConfigError("RotateConfig.turn.axis: boxes and cylinders turn about the palm's normal, (1, 0, 0)")
 
     def placed_on(self, hand: Hand) -> "RotateConfig":

@@ -22,8 +22,8 @@ def summarize(metrics: dict[str, np.ndarray], episode_length: np.ndarray, contro
       "successes_per_minute" is their number in all episodes over all the time that episodes lasted, the time in
       which a hand is stuck included: 60 over it is the paper's seconds per success. "seconds_per_success" is the
       time at the last goal over their number, of episodes with one or more, so that time stuck after it is left
-      out. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %: Wilson's
-      for proportions, else bootstrap over episodes.
+      out. "seconds_to_fall" is cut at the episode's length where the object stayed. "axes" has the results of each axis
+      in the order of `turn.axes`. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     seconds, successes = episode_length * control_period, metrics["successes"]
     some = successes > 0
@@ -57,6 +57,11 @@ def summarize(metrics: dict[str, np.ndarray], episode_length: np.ndarray, contro
         },
         "non_finite": int(np.sum(metrics["non_finite"] > 0)),
     }
+    axes = [
+        {"successes": _counts(successes[rows]), "kept_to_the_end": statistics.proportion(kept[rows])}
+        for rows in (metrics["axis"] == axis for axis in np.unique(metrics["axis"]))
+    ]
+    report |= {"axes": axes} if len(axes) > 1 else {}
     return report | {"headline": _headline(report)}
 
 
@@ -71,6 +76,10 @@ def _headline(report: dict) -> dict:
         "successes per minute, time stuck included": statistics.entry(report["successes_per_minute"]),
         "joint speed (rad/s)": statistics.entry(report["gait"]["joint_speed_rad_s"]),
         "fingertips at work (duty over 10 %)": int(np.sum(duty > 0.1)),
+        **{
+            f"successes (mean), axis {number}": statistics.entry(axis["successes"]["mean"])
+            for number, axis in enumerate(report.get("axes", []), 1)
+        },
     }
 
 

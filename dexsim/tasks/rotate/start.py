@@ -40,6 +40,7 @@ _VERSION = 5  # of the procedure: raise it when older pools no longer hold
 _SETTLING = 0.8  # s, for start states to come to rest; those that do not are discarded
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _HEADING_NOISE = 0.7  # rad, largest turn of the object about the axis at the start
+_HEADING_NOISE_AXES = 0.35  # rad, where the axis is commanded: about another axis a cube turned by more cannot roll
 _LEVEL = 0.35  # rad, largest angle from upright
 _UNUSED = (
     *("reward", "sensing", "observation", "skin", "control", "randomization", "turn"),
@@ -135,7 +136,7 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     """What the pool depends on; rewards, sensing and observation do not belong to it."""
     settings = {name: value for name, value in to_dict(config).items() if name not in _UNUSED}
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
-    turn = config.turn.axis, config.turn.distance
+    turn = config.turn.axis, config.turn.distance, *config.turn.axes
     boxes = load_mesh_object(config.objects).boxes if config.objects.mesh else None
     mesh = [part.tolist() for part in (boxes.size, boxes.position, boxes.quat)] if boxes else None
     given = settings, motors, turn, mesh, hand.digest, np.asarray(jax.random.key_data(key)).tolist()
@@ -193,7 +194,8 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
     flexion = close_fingers(hand, range(1, hand.num_fingers))
     curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower, hand.joint_upper)
-    heading = _HEADING_NOISE * jax.random.uniform(keys[1], minval=-1.0)
+    most = _HEADING_NOISE_AXES if config.turn.axes else _HEADING_NOISE
+    heading = most * jax.random.uniform(keys[1], minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.asarray(config.turn.unit_axis), heading)
     shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)

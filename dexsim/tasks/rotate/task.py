@@ -49,6 +49,7 @@ _RECENT = 0.2  # s, a fingertip that touched within this time before a drop push
 class RotateGoal:
     """The goal, and what has happened since the episode began."""
 
+    axis: jax.Array  # [3] of rotation
     turns: jax.Array  # [] int32 goals reached
     entered: jax.Array  # [] bool, inside the paper's window since this goal was set
     entries: jax.Array  # [] int32 goals reached as the paper counts
@@ -109,7 +110,8 @@ class Rotate(Task):
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
         (x, y, z), self._palm = placed.reference, palm_height(hand)
         self.reference = (x, y, z)
-        self._axis = jnp.asarray(self.turn.unit_axis)
+        axes = np.asarray(self.turn.axes or (self.turn.axis,), float)
+        self._axes = jnp.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
         self._step, self._sense = self.turn.step, math.copysign(1.0, self.turn.step)
         self._period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
@@ -131,7 +133,9 @@ class Rotate(Task):
 
     def begin(self, key: jax.Array | None, start: Start | None) -> RotateGoal:
         zero, none, fingers = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros(self.hand.num_fingers)
+        which = 0 if key is None or len(self._axes) == 1 else jax.random.randint(key, (), 0, len(self._axes))
         return RotateGoal(
+            axis=self._axes[which],
             turns=none,
             entered=jnp.zeros((), bool),
             entries=none,
@@ -149,7 +153,7 @@ class Rotate(Task):
         turn = self.config.turn
         angle = rotations.quat_angle(self._quat(goal), truth.object_quat)
         distance = length(truth.object_position - jnp.asarray(self.reference))
-        spin = self._sense * jnp.sum(truth.object_spin * self._axis)
+        spin = self._sense * jnp.sum(truth.object_spin * goal.axis)
         inside = (angle < turn.angle) & (distance < turn.distance)
         calm = jnp.abs(spin) <= turn.spin if turn.spin > 0 else True
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
@@ -162,10 +166,11 @@ class Rotate(Task):
             "spin": now.spin,
             "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
-            "tilt": self._tilt(truth),
+            "tilt": self._tilt(goal, truth),
             "touch": touching,
         }
         return RotateGoal(
+            axis=goal.axis,
             turns=goal.turns + now.success.astype(jnp.int32),
             entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered).astype(jnp.int32),
@@ -189,7 +194,7 @@ class Rotate(Task):
 
     def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         away = length(truth.object_position - jnp.asarray(self.reference))
-        lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
+        lost = (away > self.config.drop_distance) | (self._tilt(goal, truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(truth.object, truth.object_quat, truth.object_position)
             lost |= low < self._palm + CLEARANCE
@@ -221,7 +226,7 @@ class Rotate(Task):
         if self.config.trap > 0:
             # 2 where objects get stuck, tipped by 0.6 rad and 22 mm toward the fingertips from the reference; 0 at it.
             ahead = jnp.maximum(truth.object_position[2] - self.reference[2], 0.0)
-            terms["trap"] = -((self._tilt(truth) / 0.6) ** 2 + (ahead / 0.022) ** 2)
+            terms["trap"] = -((self._tilt(goal, truth) / 0.6) ** 2 + (ahead / 0.022) ** 2)
         ticks = jnp.maximum(after.clock / self._period, 1.0)
         mean = {name: total / ticks for name, total in after.totals.items()}
         turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
@@ -231,6 +236,7 @@ class Rotate(Task):
             "successes": turns,
             "paper_successes": after.entries.astype(jnp.float32),
             "time_at_last_success": after.last_success,
+            "axis": jnp.argmax(self._axes @ goal.axis).astype(jnp.float32),
             "angle_error": now.angle,
             "distance": now.distance,
             "pushed_out": (dropped & recent).astype(jnp.float32),
@@ -241,18 +247,20 @@ class Rotate(Task):
         }
 
     def _quat(self, goal: RotateGoal) -> jax.Array:
-        return goal_quat(goal.turns, self._axis, self._step)
+        return goal_quat(goal.turns, goal.axis, self._step)
 
-    def _tilt(self, truth: GroundTruth) -> jax.Array:
+    def _tilt(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         """Angle [] rad between the object's own axis and the axis of rotation."""
-        own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), self._axis)
-        across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
-        return jnp.arctan2(across, jnp.sum(own * self._axis))
+        own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), goal.axis)
+        across = jnp.linalg.norm(jnp.cross(own, goal.axis) + 1e-12)
+        return jnp.arctan2(across, jnp.sum(own * goal.axis))
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
-        """Rows [count], evenly spread over those of the pool outside the trap; goals that end with a drop only."""
+        """Rows [count], evenly spread over those of the pool outside the trap; goals that end with a drop only, their
+        axes in turn."""
         goal = dataclasses.replace(self.begin(None, None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
+        goals = dataclasses.replace(goals, axis=self._axes[np.arange(count) % len(self._axes)])
         size = self.config.pool_size  # of each of the pools that follow one another here
         free = np.flatnonzero(np.arange(len(shape_index)) % size < size - round(self.config.trap * size))
         return free[np.linspace(0, len(free) - 1, count).round().astype(int)], goals

@@ -14,7 +14,7 @@ to return to the start posture.
 import collections
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,6 +101,7 @@ class EmulatedHand:
     seconds: float | None = None  # time limit of a trial; None is that of the task
     shape_name: str | None = None  # of the objects (grasp); None samples one per trial
     first: int = 0  # number of the first trial
+    axis: Sequence[float] = ()  # of rotation [3], of a right hand; empty: that of the task
     plant_model: str | Path | None = None  # MJCF (`hand_model.read_model`) whose body and contacts replace our own
 
     def __post_init__(self) -> None:
@@ -114,7 +115,7 @@ class EmulatedHand:
         self._command: np.ndarray | None = None
         # The fingers of a hand without commands are slightly bent.
         self._joints = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
-        self.start = start_of(hand, self.task)
+        self.start = start_of(hand, self.task, self.axis)
         self._done: list[dict[str, Any]] = []
         self.trial = self.first - 1
         self._next_trial()
@@ -199,7 +200,7 @@ class EmulatedHand:
         rng = np.random.default_rng([self.seed, self.trial])
         for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
             parameters = sample_trial(self.task, rng, self.kind, self.overrides, self.hand)
-            shape = sample_shape(parameters, rng, self.shape_name, self.start.axis)
+            shape = sample_shape(parameters, rng, self.shape_name, self.start.upright)
             scene = self._draw(parameters, shape)
             own = next((float(geom.position[0]) for geom in self.hand.geoms if geom.kind == "plane"), PALM_FACE)
             self._palm_face = palm_face(scene, self.start.place[-2:]) if self._model.foreign else own
@@ -404,7 +405,7 @@ def find_place(
     scene.set_joints(data, start.posture)
     for _ in range(_PLACES):
         if parameters.task != "grasp":
-            quat = turn(start.axis, parameters.heading_error * rng.uniform(-1, 1))
+            quat = turn(start.upright, parameters.heading_error * rng.uniform(-1, 1))
             shift = parameters.place_error * rng.uniform(-1, 1, 2)
             gap, speed = 0.0005, 0.0
         else:

@@ -11,7 +11,7 @@ may not choose what it is tested by. The other ranges repeat training's; a test 
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -218,17 +218,22 @@ class Start(NamedTuple):
         """Whether the fingers hold the object clear of the palm."""
         return len(self.place) == 3
 
+    @property
+    def upright(self) -> np.ndarray:
+        """The direction [3] that a face of the object is across at the start."""
+        return self.axis if self.clear else np.array((1.0, 0.0, 0.0))
 
-def start_of(hand: Hand, task: str) -> Start:
-    """The start by the hand's TOML; goals, mount and place of a left hand are the mirror image of those of a right
-    one. HandError: there is none in it."""
+
+def start_of(hand: Hand, task: str, axis: Sequence[float] = ()) -> Start:
+    """The start by the hand's TOML, and the axis [3] of rotation of a right hand; empty: that of the task. Goals, mount
+    and place of a left hand are the mirror image of those of a right one. HandError: there is none in the TOML."""
     side = hand.thumb_side
     mirror, quarter = np.array((1.0, side, 1.0)), side * np.pi / 2
     if task == "rotate_clear":
         if hand.num_joints != len(CLEAR_POSTURE):
             raise HandError(f"{hand.name}: the emulated hand has the start of rotate_clear for the XHand only")
-        middle, place, axis = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array((0.6, 0.0, -0.8))
-        return Start(np.array(CLEAR_POSTURE), middle, place, gravity(-1.1, 0.0, side), quarter, axis)
+        middle, place, curled = mirror * CLEAR_REFERENCE, mirror * CLEAR_PLACE, np.array((0.6, 0.0, -0.8))
+        return Start(np.array(CLEAR_POSTURE), middle, place, gravity(-1.1, 0.0, side), quarter, curled)
     if skill_of(task) == "grasp":
         posture, reference, names = hand.grasp_posture, hand.grasp_centre, "[grasp] with posture and centre"
         place, down = np.array(reference[1:]), GRAVITY * np.array([1.0, 0.0, 0.0])
@@ -237,7 +242,9 @@ def start_of(hand: Hand, task: str) -> Start:
         place, down = mirror[1:] * ROTATE_PLACE, gravity(-0.2, -0.2, side)
     if not (posture and reference):
         raise HandError(f"{hand.name}: the emulated hand needs a {names} in its TOML")
-    return Start(np.array(posture), np.array(reference), place, down, quarter)
+    return Start(
+        np.array(posture), np.array(reference), place, down, quarter, mirror * np.array(axis or (1.0, 0.0, 0.0))
+    )
 
 
 def gravity(pitch: float, roll: float, side: float) -> np.ndarray:

@@ -121,6 +121,25 @@ class TestGoal:
         np.testing.assert_allclose(goal.last_success, 8 * PERIOD, rtol=1e-5)
         np.testing.assert_allclose(goal.totals["spin"], 1 + 4 + 4 + 0.5 + 0.5 + 1 + 1 + 1, rtol=1e-5)
 
+    def test_an_episode_turns_about_the_axis_it_drew_and_evaluations_take_them_in_turn(self, rules_of):
+        axes = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
+        rules = rules_of(RotateConfig(turn=TurnSpec(spin=2.0, axes=axes)))
+        drawn = jax.vmap(lambda key: rules.task.begin(key, None))(jax.random.split(jax.random.key(0), 200))
+        found, counts = np.unique(drawn.axis, axis=0, return_counts=True)
+        assert found.tolist() == [[-1, 0, 0], [0, 1, 0], [1, 0, 0]] and counts.min() > 40
+        plan = rules.task.evaluation_plan(6, np.zeros(6, int))[1]
+        assert plan.axis.tolist() == 2 * [[1, 0, 0], [-1, 0, 0], [0, 1, 0]]
+        for number, (way, sign) in enumerate((("x", 1), ("x", -1), ("y", 1))):
+            goal = jax.tree.map(lambda leaf, number=number: leaf[number], plan)
+            quat, spin = (
+                quat_of(Rotation.from_euler(way, 90 * sign, degrees=True)),
+                sign * (np.array(["x", "y", "z"]) == way),
+            )
+            here = rules.truth(object_quat=quat, object_spin=spin.astype(float))
+            now, (_, metrics) = rules.progress(goal, here), rules.rewards(goal, here)
+            assert now.success and now.spin == 1 and metrics["axis"] == number and metrics["tilt"] < 1e-3
+            assert not rules.progress(goal, rules.truth(object_quat=turned(180, (0, 0, 1)))).success
+
 
 @pytest.mark.parametrize(("tilt", "roll"), [(0.0, 0.0), (-0.3, -0.2), (0.4, 0.3)])
 def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
@@ -227,6 +246,7 @@ def test_every_term_of_a_tick(weighted):
         "time_at_last_success": 0.0,
         "angle_error": math.radians(60),
         "distance": 0.05,
+        "axis": 0.0,
         "pushed_out": 0.0,
         "slipped": 0.0,
         "spin": 0.6,
@@ -307,7 +327,7 @@ class TestDrop:
         for degrees, lost in ((55, False), (59, True), (180, True)):
             tipped = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_euler("x", 1.0)
             here = rules.truth(object_quat=quat_of(tipped))
-            np.testing.assert_allclose(rules.task._tilt(here), math.radians(degrees), atol=1e-3)
+            np.testing.assert_allclose(rules.task._tilt(rules.begun, here), math.radians(degrees), atol=1e-3)
             assert bool(rules.dropped(rules.begun, here)) == lost
         assert not bool(rules.dropped(rules.begun, rules.truth(object_quat=turned(170))))
 
@@ -487,6 +507,7 @@ def test_hand_computed():
         "joint_speed": np.full(n, 0.5),
         "action_rate": zero,
         "tilt": zero,
+        "axis": np.array([0.0, 1, 0, 1]),
         "pushed_out": np.array([1.0, 0, 0, 0]),
         "slipped": np.array([0.0, 1, 0, 0]),
         "non_finite": zero,
@@ -508,6 +529,8 @@ def test_hand_computed():
     assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
     assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
     assert report["headline"]["fingertips at work (duty over 10 %)"] == 1
+    assert [axis["successes"]["mean"]["mean"] for axis in report["axes"]] == [10, 20]
+    assert [axis["kept_to_the_end"]["mean"] for axis in report["axes"]] == [0.5, 0.5]
 
 
 def test_start_states_rest_on_the_rubber_of_the_skin(hand):

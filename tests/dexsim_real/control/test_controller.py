@@ -9,7 +9,9 @@ import pytest
 from episodes import still_moment
 from test_safety import CYCLE, MIDDLE, Bench
 
+from dexsim.core.errors import ConfigError
 from dexsim.env.sensors import SensorSuite
+from dexsim.hand.load import load_hand
 from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec, TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
@@ -205,6 +207,21 @@ def test_a_goal_passed_at_speed_does_not_count_and_a_quaternion_of_the_other_sig
     for k in range(100):
         goals.update(0.03 * k, seen(way * rate * 0.03 * k, sign=sign**k))
     assert goals.successes == counted
+
+
+@pytest.mark.parametrize("side", ["xhand_right", "xhand_left"])
+def test_a_told_axis_turns_as_in_training(hand, side):
+    """On a left hand as its mirror image; an axis that the policy does not know is refused."""
+    axes, trained, hand = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0)), hand, load_hand(side)
+    config = RotateConfig(turn=TurnSpec(axes=axes))
+    policy = Acts(Rotate(config, trained), trained, lambda observation: np.zeros(12, np.float32))
+    task = Rotate(config, hand)
+    for number, axis in enumerate(axes):
+        goals = TurnGoals(Controller(policy, hand, axis).spec.turn, REFERENCE)
+        plan = jax.tree.map(lambda leaf, number=number: leaf[number], task.evaluation_plan(2, np.zeros(2, int))[1])
+        np.testing.assert_allclose(goals.quat, task.goal_readings(plan)[1], atol=1e-6)
+    with pytest.raises(ConfigError, match="axis \\(0.0, 0.0, 1.0\\): the policy can be told"):
+        Controller(policy, hand, (0.0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize(("off", "counts"), [(0.049, True), (0.051, False)])
