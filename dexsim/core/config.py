@@ -7,8 +7,11 @@ import ast
 import contextlib
 import dataclasses
 import functools
+import inspect
+import itertools
 import json
 import math
+import textwrap
 import types
 import typing
 from collections.abc import Collection, Iterable
@@ -38,7 +41,49 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-class Config:
+class _Documented(type):
+    """The type of classes whose docstrings list their fields, for `help()`, notebooks and command lines alike."""
+
+    @property
+    def __doc__(cls) -> str:  # type: ignore[override]
+        # To read the sources at import would take longer than the rest of it: `dataclass` asks before it sets this.
+        return _document(cls) if "__match_args__" in vars(cls) else vars(cls).get("__doc__") or cls.__name__
+
+
+@functools.cache
+def _document(cls: Any) -> str:
+    """The docstring as written, then each field with its text, unit and range."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__[:-1]):
+        with contextlib.suppress(OSError, TypeError):  # of a class typed into an interpreter, or not written in Python
+            (parsed,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+            for field, text in itertools.pairwise(parsed.body):  # type: ignore[attr-defined]
+                if (
+                    isinstance(field, ast.AnnAssign)
+                    and isinstance(text, ast.Expr)
+                    and isinstance(text.value, ast.Constant)
+                ):
+                    texts[ast.unparse(field.target)] = " ".join(str(text.value.value).split())
+    lines = [
+        f"  {field.name}: {texts[field.name]}{_limits(field)}"
+        for field in dataclasses.fields(cls)
+        if field.name in texts
+    ]
+    own = inspect.cleandoc(vars(cls).get("__doc__") or cls.__name__)
+    return "\n".join([own, "", "Attributes:", *lines]) if lines else own
+
+
+def _limits(field: Any) -> str:
+    """Unit and range of a setting in brackets, as far as it has them."""
+    told, (unit, low, high) = list[str](), (field.metadata.get(key) for key in ("unit", "low", "high"))
+    if unit and unit != "1":
+        told.append(unit)
+    if low is not None and math.isfinite(low):
+        told.append(f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more")
+    return f" [{', '.join(told)}]" if told else ""
+
+
+class Config(metaclass=_Documented):
     """Base of configuration dataclasses: every field is checked against its type and its `setting` when one is made.
 
     Lists become tuples and NumPy's numbers Python's, as a file would give them back. A subclass with checks of its own

@@ -18,8 +18,13 @@ from dexsim.tasks.grasp.config import GraspConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Spring(Config):
+    """A spring."""
+
     stiffness: float = setting(2.0, unit="N/m", low=0.5, high=8.0)
+    """Force over
+    length."""
     turns: int = setting(3, low=1)
+    """Number of turns."""
     rest: float = setting(0.0, unit="m", high=0.1)
     span: Range = setting((0.0, 1.0), unit="m", low=-1.0, high=2.0)
     wire: str = setting("steel", choices=("steel", "brass"))
@@ -33,6 +38,19 @@ class Spring(Config):
 class Chair(Config):
     legs: int = setting()
     seat: Spring = setting(Spring())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bed(Spring):
+    colour: str = "red"
+    """Of the cover."""
+
+
+def test_docstrings_list_fields_with_texts_units_and_ranges():
+    listed = ["  stiffness: Force over length. [N/m, 0.5 to 8]", "  turns: Number of turns. [1 or more]"]
+    assert Spring.__doc__.splitlines() == ["A spring.", "", "Attributes:", *listed]
+    assert Bed.__doc__.splitlines() == ["Bed", "", "Attributes:", *listed, "  colour: Of the cover."]
+    assert "  mass: Mass of the object. [kg, 0.001 to 5]" in ObjectConfig.__doc__
 
 
 def message(build, *arguments, **keywords):
