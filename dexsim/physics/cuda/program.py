@@ -120,58 +120,53 @@ def compile_kernel(text: str, architecture: str) -> bytes:
     Raises:
       ConfigError: NVRTC is missing or fails.
     """
-    compiler = find_compiler()
     options = (*OPTIONS, f"--gpu-architecture={architecture}")
-    digest = hashlib.sha256(repr((text, sorted(headers().items()), options, compiler.version)).encode())
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    _nvrtc("Version", ctypes.byref(major), ctypes.byref(minor))
+    version = major.value, minor.value
+    digest = hashlib.sha256(repr((text, sorted(headers().items()), options, version)).encode())
     path = cache_path("cuda") / f"{digest.hexdigest()}.cubin"
     if path.exists():
         return path.read_bytes()
-    code = compiler.compile(text, headers(), options)
+    code = compile_source(text, options)
     with contextlib.suppress(OSError):  # a disk without room or rights
         write_atomic(path, [code])
     return code
 
 
-class Compiler:
-    """NVRTC."""
+def compile_source(text: str, options: tuple[str, ...]) -> bytes:
+    """A cubin of a source that includes `headers`; errors as in `compile_kernel`."""
+    names, texts = _strings(headers().keys()), _strings(headers().values())
+    program = ctypes.c_void_p()
+    _nvrtc("CreateProgram", ctypes.byref(program), text.encode(), b"kernel.cu", len(names), texts, names)
+    try:
+        if find_compiler().nvrtcCompileProgram(program, len(options), _strings(options)):
+            log = _read(program, "ProgramLog").decode(errors="replace").strip("\0\n")
+            first = next((line for line in log.splitlines() if "error" in line), log)
+            raise ConfigError(f"backend 'cuda': NVRTC: {first}")
+        return _read(program, "CUBIN")
+    finally:
+        find_compiler().nvrtcDestroyProgram(ctypes.byref(program))
 
-    def __init__(self, library: ctypes.CDLL):
-        self._library = library
-        major, minor = ctypes.c_int(), ctypes.c_int()
-        library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
-        self.version = major.value, minor.value
 
-    def compile(self, text: str, included: Mapping[str, str], options: tuple[str, ...]) -> bytes:
-        """A cubin of a CUDA source; errors as in `compile_kernel`."""
-        library, program = self._library, ctypes.c_void_p()
-        names, texts = _strings(included.keys()), _strings(included.values())
-        self._check(
-            library.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"kernel.cu", len(included), texts, names)
-        )
-        try:
-            if library.nvrtcCompileProgram(program, len(options), _strings(options)):
-                log = self._read(program, "ProgramLog").decode(errors="replace").strip("\0\n")
-                first = next((line for line in log.splitlines() if "error" in line), log)
-                raise ConfigError(f"backend 'cuda': NVRTC {self.version[0]}.{self.version[1]}: {first}")
-            return self._read(program, "CUBIN")
-        finally:
-            library.nvrtcDestroyProgram(ctypes.byref(program))
+def _read(program: ctypes.c_void_p, what: str) -> bytes:
+    size = ctypes.c_size_t()
+    _nvrtc(f"Get{what}Size", program, ctypes.byref(size))
+    content = ctypes.create_string_buffer(size.value)
+    _nvrtc(f"Get{what}", program, content)
+    return content.raw
 
-    def _read(self, program: ctypes.c_void_p, what: str) -> bytes:
-        size = ctypes.c_size_t()
-        self._check(getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)))
-        content = ctypes.create_string_buffer(size.value)
-        self._check(getattr(self._library, f"nvrtcGet{what}")(program, content))
-        return content.raw
 
-    def _check(self, code: int) -> None:
-        if code:
-            self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
-            raise ConfigError(f"backend 'cuda': NVRTC: {self._library.nvrtcGetErrorString(code).decode()}")
+def _nvrtc(name: str, *arguments: Any) -> None:
+    """Call a function of NVRTC. Raises ConfigError: with its text for the error that it returns."""
+    library = find_compiler()
+    if code := getattr(library, f"nvrtc{name}")(*arguments):
+        library.nvrtcGetErrorString.restype = ctypes.c_char_p
+        raise ConfigError(f"backend 'cuda': NVRTC: {library.nvrtcGetErrorString(code).decode()}")
 
 
 @functools.cache
-def find_compiler() -> Compiler:
+def find_compiler() -> ctypes.CDLL:
     """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order.
 
     Raises:
@@ -183,7 +178,7 @@ def find_compiler() -> Compiler:
             # NVRTC opens its builtins by their name alone, which finds them only once they are loaded.
             for builtins in Path(path).parent.glob("libnvrtc-builtins.so*") if isinstance(path, Path) else ():
                 ctypes.CDLL(str(builtins))
-            return Compiler(library)
+            return library
     raise ConfigError(f"backend 'cuda' needs NVRTC, which comes with JAX for CUDA: {install_line('cuda')}")
 
 

@@ -102,7 +102,7 @@ def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
 @pytest.mark.parametrize("task", ["rotate", "grasp"])
 def test_tasks_compile(task, grasp_env, emulated, monkeypatch):
     try:
-        compiler = program.find_compiler()
+        program.find_compiler()
     except ConfigError as error:
         pytest.skip(str(error))
     texts = []
@@ -114,7 +114,7 @@ def test_tasks_compile(task, grasp_env, emulated, monkeypatch):
     for _ in range(2):
         jax.eval_shape(tick_of(env, physics_of(env, "cuda")), states)
     assert texts[0] == texts[1], "kernels are cached by their text"
-    code = compiler.compile(texts[0], program.headers(), (*program.OPTIONS, "--gpu-architecture=sm_90"))
+    code = program.compile_source(texts[0], (*program.OPTIONS, "--gpu-architecture=sm_90"))
     assert code[:4] == b"\x7fELF"
     for name in (program.ENTRY, program.SHARED_BYTES):
         assert name.encode() in code
