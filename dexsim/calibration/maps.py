@@ -146,17 +146,15 @@ _SIDES = """
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
-    """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
+    """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it. Raises OSError: it
+    cannot be written."""
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}"]
     lines += [f"{name} = {json.dumps(getattr(calibration, name), ensure_ascii=False)}" for name in _WORDS]
     lines += [f"{name} = {_text(getattr(calibration, name))}  # {unit}" for name, unit in _UNITS.items()]
     lines.append(_SIDES)
     for name, side in (("real", calibration.real), ("sim", calibration.sim)):
         lines += [f"[{name}]", *(f"{field} = {_text(values)}" for field, values in vars(side).items())]
-    try:
-        write_atomic(Path(path), ["\n".join([*lines, ""]).encode()])
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
+    write_atomic(Path(path), ["\n".join([*lines, ""]).encode()])
 
 
 def _text(values: Any) -> str:
@@ -209,10 +207,6 @@ def check_plausible(where: object, calibration: Calibration, hand: Hand) -> None
     """Check every number that a run uses: a wrong torque from a file would drive the motors wrongly.
 
     The ranges are far from the values of a good hand: a wrong unit is found, an unusual hand is no error.
-
-    Args:
-      where: named in errors.
-      calibration: of this hand, with arrays of the right shapes.
 
     Raises:
       CalibrationError: names the joint or finger, the quantity, its value and its range.

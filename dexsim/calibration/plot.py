@@ -7,7 +7,6 @@ import numpy as np
 
 from dexsim.calibration.fit import JointPress, find_swings
 from dexsim.calibration.maps import Calibration
-from dexsim.core.errors import CalibrationError
 
 
 def plot_calibration(
@@ -18,16 +17,10 @@ def plot_calibration(
     joints: tuple[str, ...] | None = None,
 ) -> None:
     """Write a figure (.png, .pdf or .svg) with one row a joint: the hand, the simulation, both normalised. By default
-    of all joints that were recorded on both sides.
-
-    Raises:
-      CalibrationError: none of the joints was recorded on both sides.
-    """
+    of all joints that were recorded on both sides."""
     from matplotlib.figure import Figure
 
     names = [n for n in joints or calibration.joint_names if n in real and n in sim]
-    if not names:
-        raise CalibrationError("nothing to draw: no joint was recorded on both sides")
     figure = Figure(figsize=(11, 2.6 * len(names) + 0.4), layout="constrained")
     for row, name in zip(figure.subplots(len(names), 3, squeeze=False), names, strict=True):
         joint = calibration.joint_names.index(name)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.ndimage import label
+from scipy.ndimage import binary_fill_holes
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from trimesh import Trimesh
@@ -171,8 +171,7 @@ def _shell(mesh: Trimesh) -> Trimesh:
     count = np.ceil((points.max(0) + 3 * cell - low) / cell).astype(int)
     middles = low + cell * (np.indices(count).reshape(3, -1).T + 0.5)
     tree = cKDTree(points)
-    regions, _ = label(tree.query(middles, distance_upper_bound=cell)[0].reshape(count) > cell)
-    solid = regions != regions[0, 0, 0]
+    solid = binary_fill_holes(tree.query(middles, distance_upper_bound=cell)[0].reshape(count) <= cell)
     _fill_diagonals(solid)
     boundary = trimesh.voxel.ops.multibox(np.argwhere(solid), remove_internal_faces=True)
     corners = low + cell * (boundary.vertices + 0.5)

@@ -82,11 +82,8 @@ class GymVectorEnv(VectorEnv):
         """
         if seed is None:
             seeds = self.np_random.integers(2**32, size=self.num_envs)
-        elif isinstance(seed, (int, np.integer)):
-            super().reset(seed=int(seed))
-            seeds = seed + np.arange(self.num_envs)
         else:
-            seeds = np.array(seed)
+            seeds = seed + np.arange(self.num_envs) if np.ndim(seed) == 0 else np.array(seed)
             super().reset(seed=int(seeds[0]))
         self._state = self._reset((seeds % 2**32).astype(np.uint32))
         return np.array(self._state.obs["actor"]), {}
