@@ -218,10 +218,7 @@ def observe(
     A left hand is observed as its mirror image, so that a policy of a right hand moves it, and the other way round.
 
     Args:
-      hand: the hand's description (static).
-      readings: one tick of measurements.
       names: the task's fields, such as `GRASP` (66 values for the shipped hand) or `ROTATE` (65).
-      config: what to leave out and how to encode.
       motion: for a critic whose fields ask for it.
       pose: of the hand at the readings' joint angles, where it is known already.
 

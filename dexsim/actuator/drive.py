@@ -69,8 +69,7 @@ def joint_torque(
     """Torque of the motors, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
     This is the torque that corresponds to the motor's current; `apply_friction` subtracts the gear's friction.
-
-    Args: scalars, of one joint, or arrays [J] of all, which broadcast.
+    Arguments are scalars, of one joint, or arrays [J] of all, which broadcast.
     """
     torque = demanded_torque(actuator, target, target_velocity, position, velocity)
     limit = torque_limit(actuator, velocity)

@@ -133,7 +133,6 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> tuple[S
 
     Args:
       unit: "A" or "Nm", of `press.value`.
-      where: named in errors.
 
     Returns:
       The lines ([2], maxima and friction []), and notes on what makes them doubtful. Where the joint moved one way
@@ -266,11 +265,9 @@ def jackknife(curvature: np.ndarray, design: np.ndarray, residual: np.ndarray, g
 def check_signals(
     where: str, least: int, signals: Mapping[str, tuple[np.ndarray, str]], saturated: float, top: float = 1 - 1e-9
 ) -> None:
-    """Check the signals of one recording.
+    """Check the signals of one recording, of `least` samples at least.
 
     Args:
-      where: named in errors.
-      least: samples that are needed.
       signals: array [T] and its unit, by name.
       saturated: largest share of the samples that may be at the maximum; not of angles, which rest.
       top: share of the maximum from which on a sample is at it.

@@ -78,14 +78,8 @@ def check_lerobot(folder: Path) -> None:
 
 
 def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Trajectory]) -> Path:
-    """Write a dataset, one episode for each trajectory, whole or not at all; returns its folder.
-
-    Args:
-      folder: must not exist yet (`check_lerobot`).
-      hand: whose trajectories they are.
-      task: what was done, a phrase.
-      trajectories: at least one.
-    """
+    """Write a dataset of a `task`, which is a phrase, one episode for each trajectory, whole or not at all; returns its
+    folder, which must not exist yet (`check_lerobot`)."""
     columns: dict[str, list[np.ndarray]] = {}
     episodes, begin = [], 0
     for number, trajectory in enumerate(trajectories):

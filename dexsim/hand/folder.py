@@ -25,11 +25,8 @@ _PITCH = 0.0035  # m, at most
 def write_hand(
     draft: Draft, name: str, remarks: Iterable[str], folder: Path, grasp: Mapping[str, Iterable[float]] | None = None
 ) -> Path:
-    """Write NAME.xml and NAME.toml into the folder, with remarks as their first lines. Returns the TOML's path.
-
-    Args:
-      grasp: entries of the TOML's `[grasp]`; None for none.
-    """
+    """Write NAME.xml and NAME.toml into the folder, with remarks as their first lines and `grasp` as the TOML's table
+    of that name. Returns the TOML's path."""
     remarks = tuple(remarks)
     comment = "".join(f"  {line}\n" for line in remarks).replace("--", "- -")
     model = _mjcf(draft, name).to_xml().replace(">\n", f">\n  <!--\n{comment}  -->\n", 1)

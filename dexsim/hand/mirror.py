@@ -155,11 +155,7 @@ def check_new(*paths: Path) -> None:
 
 
 def write_mirror(path: Path, folder: Path) -> Path:
-    """Write the files of a hand's mirror image, its meshes included; the path of the new TOML.
-
-    Args:
-      path: the hand's TOML.
-      folder: must not have any of the new files.
+    """Write the files of a hand's mirror image, its meshes included, from its TOML; the path of the new TOML.
 
     Raises:
       AssetError: a file of the hand is missing or broken, or the new one exists.

@@ -73,10 +73,8 @@ class Physics:
         """Compile.
 
         Args:
-          hand: the hand; its MJCF is read again here.
           slots: kinds of the object's primitives.
           largest: [K, 3] m, the largest size of each slot (broad phase bounds).
-          config: solver and contact model.
           gravity: m/s^2 in the palm frame, which is the world's.
           backend: "auto", "c", "cuda" or "mjx".
           pad_thickness: m, of the rubber over the fingertips, by which their geoms are enlarged (`Skin.margin`).
@@ -100,13 +98,10 @@ class Physics:
     def advance(
         self, law: TorqueLaw, fields: Fields, state: PhysicsState, push: jax.Array, held: jax.Array | None = None
     ) -> StepResult:
-        """Run one control tick of `PhysicsConfig.substeps` sub-steps.
+        """Run one control tick; see `Backend.advance`.
 
         Args:
-          law: the motors, called before every sub-step.
           fields: of the environment (`fields`).
-          state: where to start from.
-          push: [3] N, force on the object's centre of mass during the whole tick.
           held: [] bool, whether somebody holds the object: weightless, it is where it was at the end; None for no.
         """
         if held is not None:
@@ -131,7 +126,6 @@ class Physics:
         """What one environment has in place of the scene's.
 
         Args:
-          object: the object.
           tip_stiffness: [F] the fingertips' stiffness over the nominal one (`tip_stiffness`); None for 1.
           pad_thickness_delta: [] m, change of the thickness of their rubber.
         """

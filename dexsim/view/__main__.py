@@ -44,12 +44,7 @@ class ViewArguments(Config):
 
 
 def open_source(arguments: ViewArguments) -> "Source":
-    """What the arguments ask to be shown.
-
-    Raises:
-      ConfigError: it is neither a policy nor a task.
-      DexsimError: see the sources.
-    """
+    """What the arguments ask to be shown. Raises DexsimError: it cannot be."""
     name = arguments.what
     if name.endswith((".npz", ".log")):
         from dexsim.datasets.episodes import read_episodes

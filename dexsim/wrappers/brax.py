@@ -52,9 +52,6 @@ class BraxEnv(Env):
     `time_limit` (1 where the task's time limit was reached and it did not terminate).
     The observation is a dictionary with an array for each group, chosen from by brax's `policy_obs_key` and
     `value_obs_key`.
-
-    Args:
-      env: what `dexsim.make` returns.
     """
 
     def __init__(self, env: Any):

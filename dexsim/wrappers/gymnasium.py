@@ -34,8 +34,6 @@ class GymVectorEnv(VectorEnv):
     """A batch of environments behind Gymnasium's vector interface; arrays are NumPy.
 
     Args:
-      env: what `dexsim.make` returns.
-      num_envs: environments side by side.
       autoreset_mode: when a finished environment restarts. `SAME_STEP`: at once; `observation` is then the first of the
         new episode, and `info["final_obs"]` has the last of the old one. `NEXT_STEP`: in the step after, which ignores
         its action and earns nothing; Gymnasium's wrappers, such as `NormalizeObservation`, need this mode.

@@ -29,7 +29,9 @@ class CudaBackend:
           ConfigError: the driver or the compiler is missing.
         """
         self.scene = scene
-        kernel_constants(scene), find_compiler(), launch.architecture()
+        kernel_constants(scene)
+        find_compiler()
+        launch.architecture()
         self._loaded: dict[PrintedLaw, str] = {}
 
     def advance(self, fields: Fields, state: PhysicsState, law: ImplicitLaw, push: jax.Array) -> StepResult:

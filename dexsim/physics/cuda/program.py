@@ -60,10 +60,6 @@ def print_law(law: Recorded, joints: int) -> PrintedLaw:
 
     `Motor` is torque, Nm, and inertia, kg m^2, at a joint angle, rad, and velocity, rad/s (`implicit`). The order of
     operations is the recorded one; the compiler may fuse a product and a sum, as XLA does.
-
-    Args:
-      law: as recorded.
-      joints: J.
     """
     names, buffers = dict[int, str](), []
     count = len(law.constants)
@@ -95,11 +91,7 @@ def _literal(value: Any, dtype: str) -> str:
 
 
 def source(scene: PhysicsScene, law: PrintedLaw) -> str:
-    """The kernel's source, which includes `headers`.
-
-    Raises:
-      AssetError: the scene has what the kernel lacks.
-    """
+    """The kernel's source, which includes `headers`."""
     args, constants = declare_args(buffers(scene, law.buffers)), kernel_constants(scene)
     return "\n".join(['#include "warp.cuh"', args, constants, law.text, '#include "tick.cuh"', _ENTRY])
 
@@ -111,11 +103,7 @@ def headers() -> Mapping[str, str]:
 
 
 def compile_kernel(text: str, architecture: str) -> bytes:
-    """The kernel's machine code (cubin), compiled or from the cache.
-
-    Args:
-      text: of `source`.
-      architecture: of the GPU, such as sm_90.
+    """The machine code (cubin) of a `source` for an architecture such as sm_90, compiled or from the cache.
 
     Raises:
       ConfigError: NVRTC is missing or fails.

@@ -396,9 +396,6 @@ def _sort_pairs(
     Returns:
       The hand's geoms that may touch the object, by kind; spheres and capsules that only touch the hand; the pair
       [K, G] of a primitive and each of the former in order; pairs of round geoms: geom, geom or -1 - primitive, pair.
-
-    Raises:
-      AssetError: the kernel has no contacts of two kinds.
     """
     model = scene.model
     primitive = {int(geom): k for k, geom in enumerate(scene.object_geoms)}
