@@ -107,11 +107,7 @@ def _import(arguments: ImportArguments, folder: Path) -> tuple[Path, bool]:
 
 
 def fit_links(draft: Draft, options: ImportConfig) -> None:
-    """Limits, masses and capsules of all links, and the palm's box.
-
-    Raises:
-      AssetError: a finger has no motor.
-    """
+    """Limits, masses and capsules of all links, and the palm's box. Raises AssetError: a finger has no motor."""
     links = draft.links
     for name, chain in draft.fingers.items():
         if not any(links[at].is_motor for at in chain):

@@ -85,11 +85,8 @@ def register(name: str, factory: Callable[[Any, Hand], Task]) -> None:
 
 def find_task(name: str) -> TaskEntry:
     """The entry of a task by its name, or by `module:name` of the module that registers it, or that has a function of
-    that name which makes an environment of another kind.
-
-    Raises:
-      ConfigError: there is no such task or module, or the name is one of dexsim's own.
-    """
+    that name which makes an environment of another kind. Raises ConfigError: there is no such task or module, or the
+    name is one of dexsim's own."""
     module, _, word = name.rpartition(":")
     if module:
         if word in OURS:

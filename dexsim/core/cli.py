@@ -63,11 +63,8 @@ def parse(
     default: T | None = None,
 ) -> T:
     """Parse options into a dataclass with tyro, which handles `--help` and invalid values; None: this process's `argv`.
-    By default the command is the class's module, and described by the class's docstring.
-
-    Raises:
-      ConfigError: a value is out of range; names the option's class and field.
-    """
+    By default the command is the class's module, and described by the class's docstring. Raises ConfigError: a value is
+    out of range; names the option's class and field."""
     import tyro
 
     kwargs: dict[str, Any] = {} if default is None else {"default": default}

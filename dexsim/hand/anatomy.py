@@ -20,11 +20,8 @@ _SNAP = np.cos(np.radians(10.0))  # a frame this near to the file's axes is mean
 
 
 def orient(draft: Draft, options: ImportConfig) -> None:
-    """Find fingers, palm frame, signs and side, and turn the links into them.
-
-    Raises:
-      AssetError: fewer than two fingers, or no side on which they close.
-    """
+    """Find fingers, palm frame, signs and side, and turn the links into them. Raises AssetError: fewer than two
+    fingers, or no side on which they close."""
     links = draft.links
     parents = {link.parent for link in links}
     chains = [_chain(links, at) for at in range(1, len(links)) if at not in parents]

@@ -155,11 +155,8 @@ def check_new(*paths: Path) -> None:
 
 
 def write_mirror(path: Path, folder: Path) -> Path:
-    """Write the files of a hand's mirror image, its meshes included, from its TOML; the path of the new TOML.
-
-    Raises:
-      AssetError: a file of the hand is missing or broken, or the new one exists.
-    """
+    """Write the files of a hand's mirror image, its meshes included, from its TOML; the path of the new TOML. Raises
+    AssetError: a file of the hand is missing or broken, or the new one exists."""
     hand = load_hand(path)
     stem = swap_sides(path.stem)
     stem = f"{stem}_{OTHER[hand.side]}" if stem == path.stem else stem

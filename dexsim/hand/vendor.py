@@ -104,11 +104,8 @@ class Draft:
 
 
 def read_hand(path: Path, options: ImportConfig) -> Draft:
-    """Read a hand from a URDF or MJCF.
-
-    Raises:
-      AssetError: not readable, not a hand, or something that a hand's folder cannot hold.
-    """
+    """Read a hand from a URDF or MJCF. Raises AssetError: not readable, not a hand, or something that a hand's folder
+    cannot hold."""
     notes: list[str] = []
     try:
         root = ElementTree.fromstring(path.read_bytes())

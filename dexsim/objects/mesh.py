@@ -68,11 +68,8 @@ def load(path: str, *, unit: float, parts: int, repair: str = "none", changed: i
     """The object of a mesh file, in any format that trimesh reads, with `parts` boxes at most; `unit` is the file's, m,
     and `repair` what to do if it is not closed (`geometry.mesh.load_mesh`). Kept until the time `changed` is another.
 
-    What was fitted once is kept in the cache.
-
-    Raises:
-      AssetError: no such file, not closed, its inside cannot be determined, or so many boxes do not follow it (2.5 % of
-        its size off on average, or 10 % at the 99th percentile).
+    What was fitted once is kept in the cache. Raises AssetError: no such file, not closed, its inside cannot be
+    determined, or so many boxes do not follow it (2.5 % of its size off on average, or 10 % at the 99th percentile).
     """
     with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
         mesh = meshes.load_mesh(path, scale=unit, repair=repair)

@@ -73,11 +73,8 @@ def extent(object: ObjectParams, direction: jax.Array) -> jax.Array:
 
 
 def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array | None = None) -> ObjectParams:
-    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
-
-    Raises:
-      AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
-    """
+    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh. Raises
+    AssetError: the mesh is refused, see `dexsim.objects.mesh.load`."""
     keys, extreme, quat = jax.random.split(key, 8), sample_extreme(key, config.extremes), None
     kinds = config.slots
     if config.mesh:

@@ -55,11 +55,7 @@ def _attribute(which: int, device: int) -> int:
 
 @functools.cache
 def architecture() -> str:
-    """Of this process's GPUs, such as sm_90.
-
-    Raises:
-      ConfigError: they differ.
-    """
+    """Of this process's GPUs, such as sm_90. Raises ConfigError: they differ."""
     kinds = {f"sm_{_attribute(_MAJOR, device)}{_attribute(_MINOR, device)}" for device in _local_devices()}
     if len(kinds) != 1:
         raise ConfigError(

@@ -103,11 +103,8 @@ def headers() -> Mapping[str, str]:
 
 
 def compile_kernel(text: str, architecture: str) -> bytes:
-    """The machine code (cubin) of a `source` for an architecture such as sm_90, compiled or from the cache.
-
-    Raises:
-      ConfigError: NVRTC is missing or fails.
-    """
+    """The machine code (cubin) of a `source` for an architecture such as sm_90, compiled or from the cache. Raises
+    ConfigError: NVRTC is missing or fails."""
     options = (*OPTIONS, f"--gpu-architecture={architecture}")
     major, minor = ctypes.c_int(), ctypes.c_int()
     _nvrtc("Version", ctypes.byref(major), ctypes.byref(minor))
@@ -155,11 +152,8 @@ def _nvrtc(name: str, *arguments: Any) -> None:
 
 @functools.cache
 def find_compiler() -> ctypes.CDLL:
-    """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order.
-
-    Raises:
-      ConfigError: there is none.
-    """
+    """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order. Raises ConfigError: there
+    is none."""
     for path in _candidates():
         with contextlib.suppress(OSError):
             library = ctypes.CDLL(str(path))

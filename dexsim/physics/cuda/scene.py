@@ -198,11 +198,7 @@ def _axes_along(axis: np.ndarray) -> np.ndarray:
 
 
 def kernel_constants(scene: PhysicsScene) -> str:
-    """The constants of a scene as C++.
-
-    Raises:
-      AssetError: the kernel cannot run the scene.
-    """
+    """The constants of a scene as C++. Raises AssetError: the kernel cannot run the scene."""
     check_scene(scene)
     links = find_links(scene)
     return "\n".join(
