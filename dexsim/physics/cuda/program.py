@@ -28,23 +28,13 @@ from dexsim.physics.law import OPERATIONS, Recorded
 WORLDS_PER_BLOCK = 8
 """Warps of a block, which pass through the kernel's code in step."""
 ENTRY = "tick_kernel"
+"""The kernel's name in `kernel/entry.cuh`."""
 SHARED_BYTES = "shared_bytes"
 """The variable on the device that has the size of a world's shared memory."""
 # Square roots, quotients and sines of fewer instructions: no force differs by more than other roundings make it.
 OPTIONS = ("-std=c++17", "-use_fast_math", "-default-device")
 _KERNEL = Path(__file__).parent / "kernel"
 _CTYPES = {"float32": "float", "int32": "int", "bool": "bool"}
-# The warps of the last block that have no world of their own repeat the last one, and write the same bits again.
-_ENTRY = f"""
-extern "C" __device__ unsigned {SHARED_BYTES} = sizeof(Shared);
-
-extern "C" __global__ void __launch_bounds__({WORLDS_PER_BLOCK} * 32, 2) {ENTRY}(const __grid_constant__ Args args) {{
-  extern __shared__ __align__(16) char memory[];
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const int world = min(blockIdx.x * {WORLDS_PER_BLOCK} + warp, args.n - 1);
-  tick(args, world, ((Shared *)memory)[warp], lane);
-}}
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +83,8 @@ def _literal(value: Any, dtype: str) -> str:
 def source(scene: PhysicsScene, law: PrintedLaw) -> str:
     """The kernel's source, which includes `headers`."""
     args, constants = declare_args(buffers(scene, law.buffers)), kernel_constants(scene)
-    return "\n".join(['#include "warp.cuh"', args, constants, law.text, '#include "tick.cuh"', _ENTRY])
+    constants += f"constexpr int WORLDS_PER_BLOCK = {WORLDS_PER_BLOCK};"
+    return "\n".join(['#include "warp.cuh"', args, constants, law.text, '#include "entry.cuh"', ""])
 
 
 @functools.cache

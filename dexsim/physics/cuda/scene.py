@@ -203,12 +203,12 @@ def kernel_constants(scene: PhysicsScene) -> str:
     links = find_links(scene)
     return "\n".join(
         [
+            '#include "tables.cuh"',
             *_sizes(scene, links),
             *_bodies(scene, links),
             *_joints(scene),
             *_couplings(scene.model),
             *_pairs(scene, links),
-            '#include "contacts/geoms.cuh"',
             *_contacts(scene, links),
             "",
         ]
@@ -312,7 +312,7 @@ def _joints(scene: PhysicsScene) -> list[str]:
 
 
 def _couplings(model: mujoco.MjModel) -> list[str]:
-    """Joints that follow others: q - q0 = polynomial of (q' - q0')."""
+    """Joints that follow others."""
     first, second = (np.where(joint >= 0, model.jnt_dofadr[joint], -1) for joint in (model.eq_obj1id, model.eq_obj2id))
     zero = [np.where(dof >= 0, model.qpos0[dof], 0.0) for dof in (first, second)]
     compliance = model.dof_invweight0[first] + np.where(second >= 0, model.dof_invweight0[second], 0.0)
@@ -324,7 +324,6 @@ def _couplings(model: mujoco.MjModel) -> list[str]:
     ]
     return [
         f"constexpr int COUPLINGS = {model.neq};",
-        "struct Coupling { int first, second; float zero[2], polynomial[5], spring[7], compliance; };",
         *_table("Coupling", "COUPLING", rows),
     ]
 
@@ -347,13 +346,7 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
         if row < 0:
             springs.append([model.pair_friction[pair, 0], *model.pair_solref[pair], *model.pair_solimp[pair]])
         lines.append(f"{first}, {second}, {row}, {finger}, {_number(side)}, {_number(compliance[pair])}")
-    return [
-        "// Links (the object's last), row among the object's pairs (or -1 - that among the others), finger whose tip",
-        "// presses on the object, -1 where the object is the pair's first, inverse weights of both bodies in 1/kg.",
-        "struct Pair { int first, second, row, finger; float side, compliance; };",
-        *_table("Pair", "PAIR", lines),
-        _array("HAND_SPRING", np.array(springs or np.zeros((1, 8)))),
-    ]
+    return [*_table("Pair", "PAIR", lines), _array("HAND_SPRING", np.array(springs or np.zeros((1, 8))))]
 
 
 def _blocks(scene: PhysicsScene, links: Links) -> np.ndarray | None:

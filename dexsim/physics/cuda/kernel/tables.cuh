@@ -1,6 +1,23 @@
-// Rows of the tables that scene.py prints: geoms of the hand in the frames of their links.
+// Rows of the tables that scene.py prints.
 #pragma once
 #include "warp.cuh"
+
+// A joint that follows another: q - q0 = polynomial of (q' - q0').
+struct Coupling {
+  int first, second;
+  float zero[2], polynomial[5], spring[7], compliance;
+};
+
+// Two bodies that touch.
+struct Pair {
+  int first, second;  // links, the object's last
+  int row;            // among the object's pairs, or -1 - that among the others
+  int finger;         // whose tip presses on the object
+  float side;         // -1 where the object is the pair's first
+  float compliance;   // 1/kg, inverse weights of both bodies
+};
+
+// Geoms of the hand in the frames of their links.
 
 // A sphere, or a capsule: the ball that is swept along an axis.
 struct __align__(16) RoundGeom {
