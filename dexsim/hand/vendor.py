@@ -124,8 +124,8 @@ def read_hand(path: Path, options: ImportConfig) -> Draft:
                 raise ConfigError(f'{long}: meshes in millimetres need scale="0.001 0.001 0.001"')
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (ElementTree.ParseError, ValueError, ConfigError) as error:
-        raise AssetError(f"{path}: {' '.join(str(error).split())}") from None
+    except (ElementTree.ParseError, KeyError, ValueError, ConfigError) as error:  # KeyError as in `load_hand`
+        raise AssetError(f"{path}: {' '.join(str(error.args[0]).split())}") from None
     return Draft(name=root.get("name") or root.get("model") or path.stem, links=links, findings=notes)
 
 
@@ -221,11 +221,7 @@ def _drop_tendons(spec: mujoco.MjSpec, allowed: bool) -> None:
 def _find_palm(model: mujoco.MjModel, palm: str, frozen: set[int]) -> int:
     """The body from which all chains of hinges branch off."""
     if palm:
-        at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, palm)
-        if at < 0:
-            bodies = ", ".join(model.body(b).name for b in range(1, model.nbody))
-            raise ConfigError(f"--palm {palm}: no such body; it has {bodies[:300]}")
-        return at
+        return model.body(palm).id
     parents, moving = model.body_parentid, {int(model.jnt_bodyid[j]) for j in range(model.njnt) if j not in frozen}
     tips = [body for body in moving if not any(is_below(parents, other, body) for other in moving - {body})]
     if len(tips) < 2:

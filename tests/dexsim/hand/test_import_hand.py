@@ -183,7 +183,7 @@ def test_tendons_can_be_dropped_and_their_joints_coupled(tmp_path):
 REFUSED = {
     "tendon": (dict(tail=TENDON), {}, "tendons cord: not supported; give --drop-tendons and, .* --couple"),
     "one finger": (dict(bodies=("f",)), {}, "two fingers or more, got 1"),
-    "no such palm": ({}, dict(palm="hand"), "--palm hand: no such body; it has palm, thumb"),
+    "no such palm": ({}, dict(palm="hand"), "Invalid name 'hand'. Valid names: .*'palm'.*'thumb'"),
     "no such joint": ({}, dict(freeze=("wrist",)), "--freeze wrist: no such joint; it has thumb_a"),
     "couple": ({}, dict(couple=("f_b",)), "--couple f_b: expected FOLLOWER=LEADER:RATIO"),
 }
