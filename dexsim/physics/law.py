@@ -164,31 +164,18 @@ def evaluator(text: bytes) -> Callable[[list[np.ndarray]], BatchLaw]:
     constants, literals, steps, types, *results = json.loads(text)
     inputs = range(constants, constants + 3)
     written = {number: np.asarray(value, types[number][1]) for number, value in literals}
-    # What depends on constants alone is the same at all sub-steps of a tick.
-    moving, once, always = set(inputs), list[Any](), list[Any]()
-    for step in steps:
-        _, operands, number = step
-        changes = not moving.isdisjoint(operands)
-        (always if changes else once).append(step)
-        if changes:
-            moving.add(number)
-
-    def evaluate(steps: list[Any], values: dict[int, np.ndarray]) -> None:
-        """Add to `values` what `steps` make of them."""
-        for kind, operands, number in steps:
-            arguments = [values[operand] for operand in operands]
-            if kind in _SAME:
-                values[number] = arguments[0].astype(types[number][1], copy=False)
-            else:
-                values[number] = OPERATIONS[kind][0](*arguments)
 
     def bind(values: list[np.ndarray]) -> BatchLaw:
         fixed = {k: value.reshape(len(value), -1) for k, value in enumerate(values)} | written
-        evaluate(once, fixed)
 
         def law(substep: int, position: np.ndarray, velocity: np.ndarray) -> list[np.ndarray]:
             values = fixed | dict(zip(inputs, (np.asarray(substep, np.int32), position, velocity), strict=True))
-            evaluate(always, values)
+            for kind, operands, number in steps:
+                arguments = [values[operand] for operand in operands]
+                if kind in _SAME:
+                    values[number] = arguments[0].astype(types[number][1], copy=False)
+                else:
+                    values[number] = OPERATIONS[kind][0](*arguments)
             return [values[number] for number in results]
 
         return law
