@@ -42,17 +42,6 @@ class Boxes:
     quat: np.ndarray  # [K, 4]
     deviation: np.ndarray  # [2] m, between the two surfaces: mean and 99th percentile
 
-    def shape(self) -> sdf.Shape:
-        """The union, for distances."""
-        count = len(self.size)
-        return sdf.Shape(
-            ("box",) * count,
-            jnp.asarray(self.size),
-            jnp.asarray(self.position),
-            rotations.quat_to_matrix(jnp.asarray(self.quat)),
-            jnp.ones(count, bool),
-        )
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeshObject:
@@ -211,10 +200,11 @@ def _refine(start: np.ndarray, points: np.ndarray, distance: np.ndarray, extent:
 def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> Boxes:
     """Boxes from [K, 10], with their deviation."""
     position, size, quat = np.split(fit.astype(np.float32), [3, 6], axis=1)
-    boxes = Boxes(np.exp(size), position, quat / np.linalg.norm(quat, axis=1, keepdims=True), np.zeros(2))
-    shape = boxes.shape()
-    sides = [trimesh.creation.box(2 * half) for half in boxes.size]
-    for side, place, turn in zip(sides, position, np.asarray(shape.rotation), strict=True):
+    size, quat = np.exp(size), quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    turns, there = rotations.quat_to_matrix(jnp.asarray(quat)), jnp.ones(len(size), bool)
+    shape = sdf.Shape(("box",) * len(size), jnp.asarray(size), jnp.asarray(position), turns, there)
+    sides = [trimesh.creation.box(2 * half) for half in size]
+    for side, place, turn in zip(sides, position, np.asarray(turns), strict=True):
         side.vertices = side.vertices @ turn.T + place
     # Of the boxes' own surfaces what is in no other box.
     points = meshes.sample_surface(trimesh.util.concatenate(sides), 8000, rng)[0]
@@ -222,4 +212,4 @@ def _boxes(mesh: meshes.Trimesh, fit: np.ndarray, rng: np.random.Generator) -> B
     back = np.abs(meshes.signed_distance(mesh, points[outside][:2000]))
     skin = meshes.sample_surface(mesh, 2000, rng)[0].astype(np.float32)
     both = np.append(np.abs(sdf.signed_distance(skin, shape)), back)
-    return dataclasses.replace(boxes, deviation=np.array([both.mean(), np.percentile(both, 99)]))
+    return Boxes(size, position, quat, np.array([both.mean(), np.percentile(both, 99)]))
