@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.core.errors import ConfigError
 from dexsim.randomization import Randomization, sample_hand
 
 TIMES = dict(timestep=0.005, control_period=0.03)
@@ -124,19 +123,6 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
         # Elsewhere the draw is what it is without extremes.
         np.testing.assert_array_equal(values[~corners], plain[name][~corners])
     assert 0.25 < np.mean(corners) < 0.35
-
-
-@pytest.mark.parametrize(
-    ("values", "word"),
-    [
-        ({"efficiency": (1.0, 0.8)}, "efficiency"),
-        ({"scale": 3.0, "torque_factor": (0.5, 1.0)}, "torque_factor"),  # 1 - 1.5: a negative torque
-        ({"beyond": 0.2}, "extremes"),
-    ],
-)
-def test_refusals(values, word):
-    with pytest.raises(ConfigError, match=word):
-        Randomization(**values)
 
 
 # --- what each value that is drawn reaches ------------------------------------------------------------

@@ -19,11 +19,11 @@ def controller_of():
     """The controller of a policy on a hand, compiled once for all tests."""
     made = {}
 
-    def controller(policy, hand):
+    def controller(policy, hand, axis=()):
         weights = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params))
-        key = policy.task, hand.name, hash(weights)
+        key = policy.task, hand.name, hash(weights), axis
         if key not in made:
-            made[key] = Controller(policy, hand)
+            made[key] = Controller(policy, hand, axis)
         return made[key]
 
     return controller

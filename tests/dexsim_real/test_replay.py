@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, rewritten, summary
 
-from dexsim.core.errors import DexsimError
 from dexsim.view.__main__ import ViewArguments, open_source
 from dexsim_real import replay, run
 from dexsim_real.core.log import Kind, LogError
@@ -124,18 +123,3 @@ def without_ticks(folder):
     with contextlib.redirect_stdout(out):
         assert replay.main([str(path)]) == 1
     assert out.getvalue().splitlines()[-1] == "nothing could be compared"
-
-
-def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "Replay", lambda *_: pytest.fail("the replay began"))
-    log = str(tmp_path / "run.log")
-    (tmp_path / "taken.png").mkdir()
-    for option in ("--plot", "--rrd", "--output"):
-        with pytest.raises(IsADirectoryError, match="taken.png"):
-            replay.main([log, option, str(tmp_path / "taken.png")])
-    (tmp_path / "run.log").touch()
-    with pytest.raises(DexsimError, match="--output .*run.log: is the log; name another file"):
-        replay.main([log, "--output", log])
-    pytest.importorskip("pyarrow")
-    with pytest.raises(DexsimError, match="taken.png: exists already"):
-        replay.main([log, "--lerobot", str(tmp_path / "taken.png")])

@@ -224,12 +224,6 @@ class TestPool:
         for angle, most in ((askew, 0.3), (turn, 0.6)):
             assert angle.min() < -0.8 * most and angle.max() > 0.8 * most
 
-    def test_a_hand_without_a_grasp_is_refused(self, hand):
-        for missing in ("grasp_posture", "grasp_centre"):
-            bare = dataclasses.replace(hand, name="bare", **{missing: ()})
-            with pytest.raises(ConfigError, match=r"'bare' has no grasp: its TOML needs \[grasp\] with posture"):
-                Grasp(GraspConfig(), bare)
-
     def test_objects_that_do_not_fit(self, hand):
         wide = ObjectConfig(shapes=("box",), box_half=(0.07, 0.08))
         with pytest.raises(ConfigError, match="0 of 5 start states of shape 'box'"):

@@ -25,12 +25,8 @@ def test_options_that_do_not_go_together(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path)
     log.write_text("precious")
     for options, says in (
-        ({"port": None}, "--port for a hand, or --from-log"),
         ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
         ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
-        ({"gauge": True}, "--gauge needs answers, but --yes"),
-        ({"joints": ("mid_joint1",)}, "--joints is only for --identify"),
-        ({"identify": True, "fingers": ("index",)}, "--fingers is not for --identify"),
         ({"log": same}, "--log .*is the file of --output, too"),
         ({"port": None, "from_log": (log,), "output": log, "force": True}, "--output .*is the --from-log"),
         ({"output": log}, "already exists: give another --output, or --force"),

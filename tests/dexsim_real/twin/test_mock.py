@@ -4,14 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from calibrating import arguments, operator
-from scripted_driver import DriverBench, ScriptedDriver
+from scripted_driver import DriverBench
 from untrained import untrained
 
 from dexsim import load_hand
 from dexsim_real import replay, run
-from dexsim_real.calibrate import __main__ as calibrate
-from dexsim_real.core.errors import HandError
 from dexsim_real.twin.mock import MockHand
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 
@@ -44,10 +41,3 @@ def test_a_policy_runs_and_its_log_is_replayed_to_the_last_bit(name, tmp_path, c
     assert summary["end"] == "time is over" and summary["motors_off"]
     assert replay.main([str(log), "--plot", str(tmp_path / "run.png")]) == 0
     assert "all observations agree to the last bit" in capsys.readouterr().out
-
-
-def test_presses_need_taxels_and_currents(tmp_path):
-    hand = load_hand("leap_like")
-    bench = DriverBench(hand, ScriptedDriver(hand, ["currents"]))
-    with pytest.raises(HandError, match="presses need taxels and currents, and the hand has no taxels: --identify"):
-        calibrate.record(arguments(tmp_path, port=None, from_log=(tmp_path,)), hand, operator(), port=bench.port)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import re
 import termios
 
 import numpy as np
@@ -11,7 +10,6 @@ from emulated_plant import motors
 from pty_hand import QUICK, PtyHand, connect_in_memory
 from virtual_time import VirtualTime
 
-from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
@@ -19,7 +17,6 @@ from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.twin.virtual import ideal_calibration
-from dexsim_real.wire.driver import open_port
 from dexsim_real.wire.frames import Command, Frame, Mode, empty_state
 from dexsim_real.wire.link import Identity, LinkCounts, SerialHand, check_identity, read_identity
 
@@ -188,14 +185,6 @@ def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():
         with pytest.raises(HandError, match="another program has it open"):
             SerialHand(peer.port, QUICK).connect()
         port.close()
-
-
-def test_a_driver_that_is_missing_and_a_port_for_another_hand_are_one_line(hand):
-    for spec in ("sdk:no_such_module:f", "sdk:", "sdk:math:no_such_function"):
-        with pytest.raises(HandError, match=f"^{re.escape(spec)}: .*give sdk:MODULE:FUNCTION"):
-            open_port(spec, hand, QUICK)
-    with pytest.raises(HandError, match="leap_like: 16 joints and 4 x 48 taxels.*--port sdk:MODULE"):
-        open_port("/dev/hand", load_hand("leap_like"), QUICK)
 
 
 @pytest.mark.parametrize(
