@@ -262,7 +262,8 @@ class Rotate(Task):
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         goals = dataclasses.replace(goals, axis=self._axes[np.arange(count) % len(self._axes)])
         size = self.config.pool_size  # of each of the pools that follow one another here
-        free = np.flatnonzero(np.arange(len(shape_index)) % size < size - round(self.config.trap * size))
+        outside = size - round(self.config.trap * size) or size  # with all in the trap, those
+        free = np.flatnonzero(np.arange(len(shape_index)) % size < outside)
         return free[np.linspace(0, len(free) - 1, count).round().astype(int)], goals
 
     def summarize(self, metrics: dict[str, np.ndarray], episode_length: np.ndarray, control_period: float) -> dict:

@@ -319,6 +319,7 @@ def test_clocks_pushes_and_rows(hand):
     assert not np.any(goals.gives_up) and bool(task.begin(key, None).gives_up)
     assert task.evaluation_plan(4, np.zeros(2, int))[0].tolist() == [0, 0, 1, 1]
     two_pools = Rotate(RotateConfig(pool_size=8, trap=0.25), hand).evaluation_plan(12, np.zeros(16, int))[0]
+    assert len(Rotate(RotateConfig(pool_size=8, trap=1.0), hand).evaluation_plan(4, np.zeros(8, int))[0]) == 4
     assert two_pools.tolist() == [*range(6), *range(8, 14)], "none of the trap"
 
 
