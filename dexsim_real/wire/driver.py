@@ -85,7 +85,10 @@ class DriverPort(HandPort):
         super().__init__(config, passive_command(hand.num_joints))
         self.driver, self._hand = driver, hand
         self._block = driver_block(hand.num_joints, hand.num_fingers, hand.num_taxels)
-        self.missing = [name for name in WITHOUT if name not in driver.measures]
+
+    @property
+    def missing(self) -> list[str]:  # A driver may learn at `connect` what its hand measures.
+        return [name for name in WITHOUT if name not in self.driver.measures]
 
     def warnings(self) -> list[str]:
         """One line for each thing that this hand does not measure."""

@@ -176,8 +176,10 @@ def passive_command(joints: int = JOINTS) -> np.ndarray:
 def decode(data: bytes, dtype: np.dtype = STATE_BLOCK) -> np.ndarray:
     """The block in the data of an `EXCHANGE`: the hand's state, or joint commands (`COMMAND_BLOCK`).
 
-    Raises HandError: joint ids do not count up.
+    Raises HandError: wrong size, or joint ids that do not count up.
     """
+    if len(data) != dtype.itemsize:
+        raise HandError(f"block of {len(data)} bytes, expected {dtype.itemsize}")
     block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
     ids = block["id"] if dtype.base == JOINT_COMMAND else block["joint"]["id"]
     if not np.array_equal(ids, np.arange(len(ids))):

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,7 +208,6 @@ class HandPort:
     """
 
     identity = Identity()  # what the hand tells about itself
-    missing: Sequence[str] = ()  # what the hand does not measure, names in `dexsim_real.wire.driver.WITHOUT`
     refusal: Refusal | None = None  # why the newest exchange was refused
 
     def __init__(self, config: LinkConfig, passive: np.ndarray):
@@ -218,6 +217,11 @@ class HandPort:
         self._clock, self._sleep = time.monotonic, time.sleep
         self._connected, self._returning, self._generation = False, False, 0
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
+
+    @property
+    def missing(self) -> list[str]:
+        """What the hand does not measure, names in `dexsim_real.wire.driver.WITHOUT`."""
+        return []
 
     def greet(self, hand: Hand, calibration: Calibration | None) -> list[str]:
         """Connect the hand of a model; returns lines for the user. HandError: as for `connect`, or another hand."""
