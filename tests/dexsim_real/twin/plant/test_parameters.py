@@ -10,6 +10,7 @@ import pytest
 from episodes import POOL_SIZE
 
 from dexsim.core.config import to_dict
+from dexsim.hand.load import load_hand
 from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.start import CLEARANCE
 from dexsim_ppo.policy import load_policy
@@ -48,6 +49,8 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
     assert start.gravity == pytest.approx(rules.gravity)
     if skill == "rotate":
+        told = start_of(load_hand("xhand_left"), task, (0.0, -1.0, 0.0))
+        assert task == "rotate_clear" or told.axis.tolist() == [0, 1, 0] and told.upright.tolist() == [1, 0, 0]
         assert start.axis == pytest.approx(rules.turn.unit_axis) and referee.ON_PALM == CLEARANCE
         turn = rules.config.turn
         ours = (start.turn, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED)
