@@ -40,16 +40,10 @@ class Chair(Config):
     seat: Spring = setting(Spring())
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Bed(Spring):
-    colour: str = "red"
-    """Of the cover."""
-
-
 def test_docstrings_list_fields_with_texts_units_and_ranges():
     listed = ["  stiffness: Force over length. [N/m, 0.5 to 8]", "  turns: Number of turns. [1 or more]"]
     assert Spring.__doc__.splitlines() == ["A spring.", "", "Attributes:", *listed]
-    assert Bed.__doc__.splitlines() == ["Bed", "", "Attributes:", *listed, "  colour: Of the cover."]
+    assert "  pool_size: Start states generated once" in GraspConfig.__doc__, "a field of its base"
     assert "  mass: Mass of the object. [kg, 0.001 to 5]" in ObjectConfig.__doc__
 
 

@@ -15,6 +15,7 @@ from dexsim.registry import TASKS as TRAINED
 from dexsim.tasks.rotate.start import CLEARANCE
 from dexsim_ppo.policy import load_policy
 from dexsim_real.twin.plant import parameters, referee
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import BANDS, FAR, KINDS, NEAR, TASK_BANDS, sample_trial, skill_of, start_of
 
 SKILLS = ("grasp", "rotate", "rotate_clear")  # rotate_any shares all but its objects and its mount with rotate
@@ -49,7 +50,7 @@ def test_bands_rules_and_places_repeat_those_of_the_tasks_and_of_the_shipped_pol
     assert start.posture.tolist() == list(rules.config.posture) == pytest.approx(shipped["posture"])
     assert start.gravity == pytest.approx(rules.gravity)
     if skill == "rotate":
-        told = start_of(load_hand("xhand_left"), task, (0.0, -1.0, 0.0))
+        told = EmulatedHand(load_hand("xhand_left"), task, axis=(0.0, -1.0, 0.0)).start
         assert task == "rotate_clear" or told.axis.tolist() == [0, 1, 0] and told.upright.tolist() == [1, 0, 0]
         assert start.axis == pytest.approx(rules.turn.unit_axis) and referee.ON_PALM == CLEARANCE
         turn = rules.config.turn
