@@ -34,9 +34,9 @@ import numpy as np
 import dexsim
 from dexsim.core import cli
 from dexsim.core.compilation import jit
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
+from dexsim.errors import ConfigError
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.physics.interface import PhysicsState, StepResult, configured

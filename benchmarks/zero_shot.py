@@ -33,8 +33,8 @@ import numpy as np
 
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import DexsimError
 from dexsim.core.statistics import mean, proportion, ratio
+from dexsim.errors import DexsimError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot

@@ -9,9 +9,9 @@ import sys
 from collections.abc import Sequence
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
 from dexsim.core.install import require
 from dexsim.core.lazy_loading import exit_on_interrupt, restore_interrupt
+from dexsim.errors import ConfigError
 
 COMMANDS = {
     "tasks": ("dexsim.registry", "list tasks, hands and shipped policies"),

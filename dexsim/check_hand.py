@@ -20,8 +20,8 @@ import tyro
 from dexsim import registry
 from dexsim.core import cli
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
+from dexsim.errors import AssetError, ConfigError
 from dexsim.geometry import sdf
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import finger_bodies, flexion_joints, forward_kinematics, open_hand

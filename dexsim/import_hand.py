@@ -21,7 +21,7 @@ import tyro
 from dexsim.calibration.press import fingertip_strength
 from dexsim.check_hand import SPEEDS, TORQUES, report
 from dexsim.core import cli
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient, tip_of
 from dexsim.hand.fit import Capsule, fit_capsule, fit_palm
 from dexsim.hand.folder import write_hand

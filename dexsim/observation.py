@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import leaf, pytree_dataclass
+from dexsim.errors import ConfigError
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose, forward_kinematics, tip_twist

@@ -12,9 +12,9 @@ import numpy as np
 
 from dexsim.actuator.drive import Actuator
 from dexsim.core.config import Config, Range, setting
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniforms
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side

@@ -17,10 +17,10 @@ import jax
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
 from dexsim.core.config import NoSettings
-from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
 from dexsim.env.task import Task, check_task
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import DEFAULT, load_hand, shipped_hands
 from dexsim.tasks.grasp import config as grasp

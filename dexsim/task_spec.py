@@ -13,7 +13,7 @@ import numpy as np
 
 from dexsim.control import Control, correct_command
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.observation import ObservationConfig, Readings

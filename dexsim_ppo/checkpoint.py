@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 
-from dexsim.core.errors import CheckpointError
 from dexsim.core.files import write_atomic
+from dexsim.errors import CheckpointError
 from dexsim_ppo.portable import FORMAT_VERSION, MAGIC, PREFIX, digest, read_file
 
 Tree = TypeVar("Tree")

@@ -26,8 +26,8 @@ from rich.table import Table
 from dexsim.core import cli, statistics
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, override, setting
-from dexsim.core.errors import ConfigError
 from dexsim.env.evaluation import evaluation_of
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.networks import zero_carry
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy

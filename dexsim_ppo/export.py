@@ -22,9 +22,9 @@ import tyro
 from dexsim.calibration.maps import blank_calibration, save_calibration
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.core.files import temporary_beside, write_atomic
 from dexsim.core.install import require
+from dexsim.errors import ConfigError, DexsimError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.observation import FIELDS

@@ -19,9 +19,9 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
-from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.layout import LayoutEntry, layout_size
 from dexsim.core.pytree import Array, pytree_dataclass
+from dexsim.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint

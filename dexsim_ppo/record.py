@@ -23,12 +23,12 @@ from PIL import Image
 from dexsim.core import cli
 from dexsim.core.compilation import jit
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
 from dexsim.core.install import require
 from dexsim.datasets.episodes import Episodes, write_episodes
 from dexsim.datasets.lerobot import READINGS, Trajectory, check_lerobot, write_lerobot
 from dexsim.datasets.rerun import show_rerun
 from dexsim.env.evaluation import evaluation_of
+from dexsim.errors import ConfigError
 from dexsim.hand.mjcf import hand_poses
 from dexsim.render.picture import draw_scene
 from dexsim.render.render import camera_of

@@ -28,8 +28,8 @@ if __name__ == "__main__":
 import dexsim
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
-from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.core.install import require
+from dexsim.errors import ConfigError, DexsimError
 from dexsim.hand.source import record_of
 from dexsim.registry import catalog, find_task, task_option
 from dexsim_ppo import checkpoint

@@ -7,7 +7,7 @@ import pytest
 
 from dexsim import __main__ as console, registry
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo.train import TrainArguments, preset_arguments
 

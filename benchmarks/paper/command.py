@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from paper.data import BUDGETS, Budget, Experiment, commit, load_report, missing_seeds, report_path, settings_of
 from paper.experiments import EXPERIMENTS
 

@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 from scipy.stats import theilslopes
 
 from dexsim.calibration.maps import Calibration, Side, blank_calibration, check_plausible
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 from dexsim.hand.description import Hand
 
 MIN_SAMPLES = 20

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import CalibrationError
 from dexsim.core.files import read_toml, write_atomic
 from dexsim.core.pytree import Array, align, pytree_dataclass, static
+from dexsim.errors import CalibrationError
 from dexsim.hand.description import Hand
 
 FORMAT = "dexsim calibration"

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
+from dexsim.errors import AssetError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import is_device, write_atomic
 from dexsim.core.install import DISTRIBUTION
 from dexsim.core.lazy_loading import restore_interrupt
+from dexsim.errors import ConfigError, DexsimError, DexsimWarning
 
 T = TypeVar("T")
 

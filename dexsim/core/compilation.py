@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 
 # LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile. Physics run as fast,
 # networks take nearly twice as long with the older emitters.

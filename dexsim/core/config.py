@@ -17,7 +17,7 @@ import typing
 from collections.abc import Collection, Iterable
 from typing import Annotated, Any, TypeVar
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 
 T = TypeVar("T")
 Range = Annotated[tuple[float, float], "low and high, in order"]

@@ -5,7 +5,7 @@ On PyPI the name `dexsim` belongs to another project: nothing here may send a us
 
 from importlib.util import find_spec
 
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 
 DISTRIBUTION = "dexsim-xhand"
 """The distribution's name, as in pyproject.toml. The packages are imported as `dexsim`, `dexsim_ppo`, `dexsim_real`."""

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
 from dexsim.core.files import write_atomic
+from dexsim.errors import DexsimError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.source import record_of, recorded_hand

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
 from dexsim.core.files import temporary_beside
 from dexsim.core.install import require
+from dexsim.errors import DexsimError
 from dexsim.hand.description import Hand
 
 VERSION = "v3.0"

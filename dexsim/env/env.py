@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.control import move_target, observed_action
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
 from dexsim.core.ranges import sample_extreme
 from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.env.sensors import SensorInput, SensorSuite
 from dexsim.env.state import Episode, Start, State
 from dexsim.env.task import GroundTruth, Task, reward_of
+from dexsim.errors import ConfigError
 from dexsim.geometry import grid, rotations, surface_points
 from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, joint_torque
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import hinge_angles
 from dexsim.hand.mjcf import read_mjcf

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import leaf, pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
+from dexsim.errors import ConfigError
 from dexsim.hand.kinematics import HandPose
 from dexsim.objects import params
 from dexsim.objects.config import KINDS, PROPERTY_RANGES

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from trimesh import Trimesh
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 
 BLOCK = 1 << 20  # point-triangle pairs at a time
 SMALLEST, LARGEST = 1e-3, 1.0  # m, size of what a hand can hold

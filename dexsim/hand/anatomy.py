@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.description import unit
 from dexsim.hand.vendor import Direction, Draft, ImportConfig, Link
 

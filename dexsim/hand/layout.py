@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import write_atomic
+from dexsim.errors import AssetError, ConfigError
 
 _SMALLEST, _LARGEST = 1e-12, 1e-2  # m^2, area of a taxel: square millimetres are refused
 MOST = 1000

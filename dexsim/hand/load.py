@@ -12,8 +12,8 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, Range, from_dict, naming_file, setting
-from dexsim.core.errors import AssetError, ConfigError
 from dexsim.core.files import read_toml
+from dexsim.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, Geom, Hand
 from dexsim.hand.layout import MOST, lay_taxels, read_taxels
 

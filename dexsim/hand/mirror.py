@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from dexsim.core.errors import AssetError
 from dexsim.core.files import write_atomic
+from dexsim.errors import AssetError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand, read_mjcf
 

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
+from dexsim.errors import AssetError, ConfigError, OtherEnvWarning
 from dexsim.hand.description import Hand
 from dexsim.hand.load import DEFAULT, find_hand, load_hand
 from dexsim.hand.mirror import is_mirror_image

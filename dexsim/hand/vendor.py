@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.errors import AssetError, ConfigError
 from dexsim.hand.description import SHAPES, primitive_mesh
 from dexsim.hand.fit import Capsule, PalmBox
 from dexsim.hand.load import is_below, read_coupling

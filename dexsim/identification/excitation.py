@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 
 MARGIN = 0.05

@@ -20,8 +20,8 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from dexsim.calibration.fit import LEAST_PRESSES
-from dexsim.core.errors import CalibrationError
 from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.errors import CalibrationError
 from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 
 _PARTS = 20  # equal stretches of a log

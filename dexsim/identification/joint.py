@@ -19,7 +19,7 @@ import numpy as np
 
 from dexsim.actuator.drive import Actuator, apply_friction, joint_torque, pd_torque, torque_limit
 from dexsim.calibration.fit import check_signals
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 
 
 class Parameter(NamedTuple):

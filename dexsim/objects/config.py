@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.core.config import Config, Range, setting
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.geometry.mesh import REPAIRS
 from dexsim.objects.mesh import MeshObject, load
 

@@ -20,7 +20,7 @@ import trimesh
 from scipy.optimize import linear_sum_assignment, minimize
 
 from dexsim.core.assets import cached_arrays
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.geometry import mesh as meshes, rotations, sdf
 from dexsim.hand.mjcf import quaternion
 

@@ -29,7 +29,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from dexsim.core.compilation import available_cores
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.physics import ffi
 from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, places
 from dexsim.physics.law import evaluator, record

@@ -3,7 +3,7 @@
 import dataclasses
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

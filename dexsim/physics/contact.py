@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.core.errors import AssetError
 from dexsim.core.pytree import Array
+from dexsim.errors import AssetError
 from dexsim.hand.description import Hand
 
 # One sphere's share of a fingertip's stiffness: two or three of a row touch at once.

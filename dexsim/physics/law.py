@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.physics.interface import ImplicitLaw, TorqueLaw
 
 # JAX's primitives that work element by element, in NumPy and as an expression in C. In C NaNs need no care: a world

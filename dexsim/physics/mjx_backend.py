@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.physics.interface import Fields, ImplicitLaw, PhysicsScene, PhysicsState, StepResult, configured
 
 with contextlib.redirect_stdout(io.StringIO()):  # It prints that Warp is missing, which nothing here uses.

@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.description import Hand
 from dexsim.hand.mjcf import disabled, read_mjcf
 from dexsim.physics import contact

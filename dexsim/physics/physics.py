@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.core.pytree import choose
+from dexsim.errors import ConfigError
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import HandPose

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import AssetError
 from dexsim.core.pytree import align
+from dexsim.errors import AssetError
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 
 MATERIALS = {"ecoflex_00_30": 7.6e3, "dragon_skin_30": 96e3, "sortaclear_40": 143e3, "rtv615": 176e3}
 """C10 [Pa] of silicones, C01 held at 0: fitted to the tensile tests of the Soft-Robotics-Materials-Database (Marechal

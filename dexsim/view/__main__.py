@@ -16,8 +16,8 @@ import tyro
 from dexsim.core import cli
 from dexsim.core.assets import asset_path
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.install import require
+from dexsim.errors import CheckpointError, ConfigError
 
 if TYPE_CHECKING:
     from dexsim.view.viewer import Source

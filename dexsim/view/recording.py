@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import Episodes
+from dexsim.errors import DexsimError
 from dexsim.render.snapshot import Snapshot
 from dexsim.view.scene import Frame
 

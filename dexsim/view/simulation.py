@@ -13,10 +13,10 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
-from dexsim.core.errors import CheckpointError
 from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
 from dexsim.env.state import State
+from dexsim.errors import CheckpointError
 from dexsim.objects.config import KINDS
 from dexsim.view.scene import Frame
 from dexsim.view.viewer import clicked

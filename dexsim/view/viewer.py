@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim.hand.description import Hand
 from dexsim.render.panel import draw_panel, read_outs
 from dexsim.view.scene import Frame, Scene

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.evaluation import evaluation_of
+from dexsim.errors import ConfigError
 
 try:
     from brax.envs.base import Env, State, Wrapper

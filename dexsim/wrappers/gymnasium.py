@@ -15,10 +15,10 @@ import jax
 import numpy as np
 
 from dexsim.core.compilation import jit
-from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.env import Env
 from dexsim.env.evaluation import take_snapshot
+from dexsim.errors import ConfigError
 from dexsim.render.render import render_frame
 
 try:

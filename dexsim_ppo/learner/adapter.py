@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.config import NoSettings
-from dexsim.core.errors import ConfigError
 from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.types import Environment
 
 MEMBERS = ("observation_size", "action_size", "max_steps", "reset", "step")

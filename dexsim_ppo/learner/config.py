@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dexsim.core.config import Config, setting
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 
 STD_MIN, STD_MAX = 0.05, 1.0
 """Bounds of the actions' standard deviation during training. More than 1 is mostly clipped at +-1."""

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from dexsim.core.compilation import check_float32, jit
-from dexsim.core.errors import ConfigError
 from dexsim.core.layout import layout_size
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, make_normalizers

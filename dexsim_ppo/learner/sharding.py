@@ -19,8 +19,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from dexsim.core.compilation import jit
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import align
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
 
 AXIS = "devices"

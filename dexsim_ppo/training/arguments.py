@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 from dexsim.core.config import Config, flat, from_dict, setting, to_dict
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, recorded_hand

@@ -7,7 +7,7 @@ import jax
 
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import NoSettings
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.registry import OURS
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig

@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.sharding import copied
 from dexsim_ppo.learner.types import TrainState

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.cli import plain
-from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_atomic
+from dexsim.errors import CheckpointError, ConfigError
 from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.arguments import TrainArguments, printable

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 import dexsim
 from dexsim.core import cli
 from dexsim.core.config import to_dict
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim.hand.source import record_of
 from dexsim.registry import task_option
 from dexsim_ppo import checkpoint

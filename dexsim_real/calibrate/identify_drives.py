@@ -15,7 +15,7 @@ import numpy as np
 
 from dexsim.calibration.maps import Calibration, load_calibration
 from dexsim.core import cli
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim.hand.description import Hand
 from dexsim.identification.excitation import excitation
 from dexsim.identification.identify import Identification, identify

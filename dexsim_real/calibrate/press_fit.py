@@ -23,7 +23,7 @@ from scipy import ndimage
 from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate, fit_line
 from dexsim.calibration.maps import Calibration
 from dexsim.calibration.press import MIN_LEVER, contact_jacobian
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 from dexsim.hand.description import Hand
 from dexsim_real.calibrate.bench import Source, read_logs
 from dexsim_real.calibrate.procedure import LOADING, RELEASED, REST, TOUCHED, UNLOADING

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.core.errors import DexsimError
 from dexsim.core.install import install_line
+from dexsim.errors import DexsimError
 
 
 class HandError(DexsimError):

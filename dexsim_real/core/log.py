@@ -22,7 +22,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim_real.core.process import BACKGROUND, change_priority
 
 MAGIC = b"DXSLOG2\n"

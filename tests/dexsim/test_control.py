@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.control import Control, ForceLoop, correct_command, move_target, observed_action
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.touch.reduce import estimate_force
 
 SPAN, PERIOD = (2.0, 7.0), 0.03

@@ -8,8 +8,8 @@ from episodes import by_field
 from random_readings import random_readings
 
 from dexsim import observation
-from dexsim.core.errors import ConfigError
 from dexsim.env.sensors import SensorSuite
+from dexsim.errors import ConfigError
 from dexsim.observation import FIELDS, GRASP, ROTATE, LayoutEntry, ObservationConfig, ObservationField, layout
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp

@@ -7,7 +7,7 @@ import pytest
 
 import dexsim
 from dexsim import registry
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 

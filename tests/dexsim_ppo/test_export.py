@@ -16,8 +16,8 @@ import dexsim
 from dexsim.calibration.maps import load_calibration
 from dexsim.control import move_target
 from dexsim.core.compilation import jit
-from dexsim.core.errors import CalibrationError, DexsimError
 from dexsim.env.evaluation import evaluation_of
+from dexsim.errors import CalibrationError, DexsimError
 from dexsim.hand.load import load_hand
 from dexsim.observation import FIELDS
 from dexsim.tasks.grasp.config import GraspConfig

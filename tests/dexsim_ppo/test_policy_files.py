@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from tiny_env import TinyConfig, leaves
 
 from dexsim.core.config import from_dict
-from dexsim.core.errors import CheckpointError, DexsimError
+from dexsim.errors import CheckpointError, DexsimError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.policy import load_policy
 

@@ -13,7 +13,7 @@ import dexsim
 from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS, find_task, make_task
 from dexsim.task_spec import TaskSpec

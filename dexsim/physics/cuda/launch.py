@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.physics import ffi
 from dexsim.physics.cuda.program import ENTRY, SHARED_BYTES, WORLDS_PER_BLOCK
 from dexsim.physics.cuda.scene import Settings, args_type

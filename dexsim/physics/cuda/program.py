@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_atomic
 from dexsim.core.install import install_line
+from dexsim.errors import ConfigError
 from dexsim.physics.cuda.scene import Buffer, buffers, declare_args, kernel_constants
 from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.law import OPERATIONS, Recorded

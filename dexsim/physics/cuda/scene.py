@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.load import rotation_matrix
 from dexsim.physics.interface import PhysicsScene
 

@@ -16,11 +16,11 @@ import numpy as np
 from dexsim import observation
 from dexsim.control import commanded_force, target_force
 from dexsim.core import compilation
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import uniforms
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
+from dexsim.errors import ConfigError
 from dexsim.geometry import rotations
 from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand

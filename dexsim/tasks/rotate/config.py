@@ -5,8 +5,8 @@ import math
 
 from dexsim.control import Control
 from dexsim.core.config import Config, Range, setting
-from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
+from dexsim.errors import ConfigError
 from dexsim.hand.description import Hand
 from dexsim.hand.mirror import mirror_point
 from dexsim.objects.config import ObjectConfig

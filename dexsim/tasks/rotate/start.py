@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from dexsim.core.assets import cached_arrays
 from dexsim.core.compilation import available_cores
 from dexsim.core.config import to_dict
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import Array
 from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.env.state import Start
+from dexsim.errors import ConfigError
 from dexsim.geometry import rotations
 from dexsim.hand.description import Hand
 from dexsim.hand.kinematics import flexion_joints, hinge_angles

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim import observation
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth, Task
+from dexsim.errors import ConfigError
 from dexsim.geometry import rotations
 from dexsim.geometry.rotations import length
 from dexsim.hand.description import Hand

@@ -13,7 +13,7 @@ import scipy.stats
 
 from dexsim.calibration import maps
 from dexsim.calibration.fit import JointPress, calibrate, find_swings, fit_joint, fit_line
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 
 # --- lines -----------------------------------------------------------------------------------
 

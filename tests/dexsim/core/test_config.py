@@ -10,7 +10,7 @@ import pytest
 from paths import ROOT
 
 from dexsim.core.config import Config, Range, from_dict, override, setting, to_dict
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
 from dexsim.randomization import Randomization
 from dexsim.tasks.grasp.config import GraspConfig

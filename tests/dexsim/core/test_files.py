@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_atomic
+from dexsim.errors import ConfigError
 
 
 def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):

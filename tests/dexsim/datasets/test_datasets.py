@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import DexsimError
 from dexsim.datasets.episodes import read_episodes, write_episodes
 from dexsim.datasets.lerobot import FPS, Trajectory, write_lerobot
+from dexsim.errors import DexsimError
 from dexsim.render.snapshot import Snapshot
 
 pyarrow = pytest.importorskip("pyarrow")

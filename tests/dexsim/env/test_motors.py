@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.core.errors import ConfigError
 from dexsim.env.motors import check_timestep
+from dexsim.errors import ConfigError
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.law import implicit
 from dexsim.randomization import Randomization

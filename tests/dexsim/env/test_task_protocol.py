@@ -18,12 +18,12 @@ import dexsim
 from dexsim import registry
 from dexsim.core.compilation import jit
 from dexsim.core.config import setting
-from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import touch_geometry
 from dexsim.env.state import Start
 from dexsim.env.task import reward_of
+from dexsim.errors import ConfigError
 from dexsim.geometry import grid, surface_points
 from dexsim.geometry.distance import signed_distance
 from dexsim.geometry.mesh import load_mesh

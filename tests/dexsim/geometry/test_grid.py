@@ -10,7 +10,7 @@ import trimesh
 from scipy.interpolate import RegularGridInterpolator
 from shapes import bake, solid
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.geometry import grid, mesh
 from dexsim.geometry.distance import distance_and_normal as measure
 

@@ -8,7 +8,7 @@ import pytest
 from paths import DATA
 from two_fingers import write
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics, hinge_angles
 from dexsim.hand.load import load_hand
 from dexsim.objects.config import ObjectConfig

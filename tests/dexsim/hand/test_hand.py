@@ -12,7 +12,7 @@ from paths import DATA
 from dexsim import check_hand
 from dexsim.calibration.press import fingertip_strength
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 

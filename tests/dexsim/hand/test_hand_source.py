@@ -8,7 +8,7 @@ import mujoco
 import pytest
 
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError, ConfigError, OtherEnvWarning
+from dexsim.errors import AssetError, ConfigError, OtherEnvWarning
 from dexsim.hand.load import load_hand
 from dexsim.hand.mirror import is_mirror_image, write_mirror
 from dexsim.hand.source import check_same, record_of, recorded_hand

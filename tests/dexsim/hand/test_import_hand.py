@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dexsim import check_hand, import_hand
 from dexsim.calibration.press import fingertip_strength
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.errors import AssetError, ConfigError
 from dexsim.hand.anatomy import orient
 from dexsim.hand.folder import write_hand
 from dexsim.hand.kinematics import forward_kinematics

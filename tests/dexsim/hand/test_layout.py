@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shapes import solid
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.geometry.distance import distance_and_normal
 from dexsim.hand.layout import lay_taxels
 from dexsim.hand.load import load_hand

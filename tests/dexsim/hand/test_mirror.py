@@ -14,7 +14,7 @@ from random_readings import random_readings
 
 from dexsim import import_hand
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.geometry import rotations
 from dexsim.hand import mirror
 from dexsim.hand.description import Hand

@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 import scipy.stats
 
-from dexsim.core.errors import CalibrationError, ConfigError
+from dexsim.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import excitation, joint_excitation
 from dexsim.identification.identify import FIT, evaluate, identify, uncertainty
 from dexsim.identification.joint import JointLog, simulate, with_defaults

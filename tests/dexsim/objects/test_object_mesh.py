@@ -7,7 +7,7 @@ import trimesh
 
 import dexsim
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.geometry.mesh import load_mesh
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import load

@@ -13,8 +13,8 @@ from episodes import POOL_SIZE
 
 import dexsim
 from dexsim.core.compilation import jit
-from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand, Motors
+from dexsim.errors import ConfigError
 from dexsim.physics import ffi, physics as engines
 from dexsim.physics.cuda import backend, launch, program
 from dexsim.physics.physics import Physics

@@ -8,7 +8,7 @@ from paths import DATA
 from physics_states import mujoco_substeps, scene_of_model, tumble
 from warp_emulation import Emulation
 
-from dexsim.core.errors import AssetError
+from dexsim.errors import AssetError
 from dexsim.hand.load import load_hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda import scene as cuda_scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp_emulation
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.physics.cuda.program import print_law
 from dexsim.physics.cuda.scene import args_type, declare_args
 from dexsim.physics.law import evaluator, record

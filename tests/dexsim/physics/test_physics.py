@@ -6,7 +6,7 @@ import jax
 import mujoco
 import pytest
 
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.errors import AssetError, ConfigError
 from dexsim.physics.model import check_model
 from dexsim.physics.physics import choose_backend
 

@@ -13,7 +13,7 @@ import pytest
 from episodes import still_moment
 from scipy.spatial.transform import Rotation
 
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object

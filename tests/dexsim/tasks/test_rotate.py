@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from shapes import integrate
 
 import dexsim
-from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
+from dexsim.errors import ConfigError
 from dexsim.hand.kinematics import tip_twist
 from dexsim.physics.config import PhysicsConfig
 from dexsim.task_spec import TurnSpec

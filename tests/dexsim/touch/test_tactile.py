@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from shapes import bake, solid
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.geometry import grid, rotations, sdf, surface_points
 from dexsim.geometry.mesh import load_mesh
 from dexsim.hand.kinematics import HandPose, forward_kinematics, taxel_positions

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.adapter import adapt
 
 MAX_STEPS = 8

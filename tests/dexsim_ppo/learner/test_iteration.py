@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 from tiny_env import SMALL, TinyConfig, TinyEnv, training_of
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner import distribution, running_stats, update
 from dexsim_ppo.learner.config import CurriculumConfig, PPOConfig
 from dexsim_ppo.learner.distribution import Decision

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv, leaves
 
-from dexsim.core.errors import ConfigError
+from dexsim.errors import ConfigError
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.sharding import make_mesh
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 from tiny_env import SMALL, TinyConfig, TinyEnv
 
-from dexsim.core.errors import CheckpointError
 from dexsim.core.files import temporary_beside
+from dexsim.errors import CheckpointError
 from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import TrainArguments

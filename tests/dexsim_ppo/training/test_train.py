@@ -17,7 +17,7 @@ from tiny_env import TinyConfig, TinyEnv, make_env, make_evaluator
 from tiny_train import PER_ITERATION
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError, DexsimError, OtherEnvWarning
+from dexsim.errors import ConfigError, DexsimError, OtherEnvWarning
 from dexsim_ppo import checkpoint, evaluate, train
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.runlog import RunFolder, policy_of, read_metrics

@@ -9,7 +9,7 @@ from pty_hand import PtyHand
 
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
-from dexsim.core.errors import DexsimError
+from dexsim.errors import DexsimError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.bench import PressConfig

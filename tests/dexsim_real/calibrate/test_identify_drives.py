@@ -10,7 +10,7 @@ from calibrating import arguments, off, operator
 from following_hand import rewritten
 from press_bench import BenchHand
 
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 from dexsim_real.calibrate import identify_drives
 from dexsim_real.calibrate.bench import CalibrateArguments
 from dexsim_real.calibrate.identify_drives import identify_hand, joint_log, read_joints, record

@@ -14,7 +14,7 @@ from dexsim.calibration.maps import (
     normalised_torque,
     torque_constants,
 )
-from dexsim.core.errors import CalibrationError
+from dexsim.errors import CalibrationError
 from dexsim.touch.reduce import estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.bench import CalibrateArguments

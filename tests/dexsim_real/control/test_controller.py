@@ -9,8 +9,8 @@ import pytest
 from episodes import still_moment
 from test_safety import CYCLE, MIDDLE, Bench
 
-from dexsim.core.errors import ConfigError
 from dexsim.env.sensors import SensorSuite
+from dexsim.errors import ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec, TurnSpec
