@@ -40,7 +40,7 @@ _VERSION = 5  # of the procedure: raise it when older pools no longer hold
 _SETTLING = 0.8  # s, for start states to come to rest; those that do not are discarded
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _HEADING_NOISE = 0.7  # rad, largest turn of the object about the axis at the start
-_HEADING_NOISE_AXES = 0.35  # rad, where the axis is commanded: about another axis a cube turned by more cannot roll
+_HEADING_NOISE_AXES = 0.35  # rad, where the axis is commanded: a cube that lies nearly square can roll, too
 _LEVEL = 0.35  # rad, largest angle from upright
 _UNUSED = (
     *("reward", "sensing", "observation", "skin", "control", "randomization", "turn"),

@@ -110,8 +110,8 @@ class Rotate(Task):
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(placed.roll), -level * math.sin(config.tilt))
         (x, y, z), self._palm = placed.reference, palm_height(hand)
         self.reference = (x, y, z)
-        axes = np.asarray(self.turn.axes or (self.turn.axis,), float)
-        self._axes = jnp.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+        axes = self.turn.axes or (self.turn.axis,)
+        self._axes = jnp.asarray([dataclasses.replace(self.turn, axis=axis).unit_axis for axis in axes])
         self._step, self._sense = self.turn.step, math.copysign(1.0, self.turn.step)
         self._period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
