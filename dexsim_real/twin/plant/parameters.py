@@ -1,10 +1,10 @@
 """Parameters of the hand and the object in a trial on the emulated hand, sampled just outside training's ranges.
 
-Each `Band` is a range of a task's default configuration, with its place there. A value is beyond one end of its range, by 5 to
-15 % of the width. Every joint, finger and trial samples its own end; where one end is impossible (a negative gear play,
-an efficiency above one) the other is used. To find out what breaks a policy, the kind "inside" samples within the
-ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model (torsional
-friction, thermal effects, ...) and is in every trial.
+Each `Band` is a range of a task's default configuration, with its place there. A value is beyond one end of its range,
+by 5 to 15 % of the width. Every joint, finger and trial samples its own end; where one end is impossible (a negative
+gear play, an efficiency above one) the other is used. To find out what breaks a policy, the kind "inside" samples
+within the ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model
+(torsional friction, thermal effects, ...) and is in every trial.
 
 Rubber and friction have ranges of the emulated hand's own (`sides` "within"), which do not follow training's: training
 may not choose what it is tested by. The other ranges repeat training's; a test compares them.
