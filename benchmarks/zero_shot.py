@@ -281,7 +281,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--trials", type=int, default=10, help="of each seed")
     add("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")
-    add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside training's ranges, or in")
+    add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside default ranges, or in")
     add("--plant-model", metavar="FILE", help="MJCF of another hand (docs/emulated_hand.md)")
     add("--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter")
     add("--limit", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="a safety limit of the bridge")
